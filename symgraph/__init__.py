@@ -1,0 +1,45 @@
+"""symgraph plans tasks that form a directed graph: skills to choose, chance, uncertainty, continuous actions."""
+
+from symgraph.errors import (
+    CompileError,
+    GraphError,
+    InputError,
+    MissingExtraError,
+    SlotError,
+    SolveError,
+    SymgraphError,
+)
+from symgraph.graph import Graph
+from symgraph.model import Model, Parameter, Propagator
+from symgraph.objective import Objective
+from symgraph.slots import Action, Gaussian, Selection, State
+from symgraph.tree import Tree, unroll
+from symgraph.optimizers import Adadelta, Ipopt, Lbfgs
+from symgraph.plan import Plan
+from symgraph.planner import solve
+
+__all__ = [
+    "Action",
+    "Adadelta",
+    "CompileError",
+    "Gaussian",
+    "Graph",
+    "GraphError",
+    "InputError",
+    "Ipopt",
+    "Lbfgs",
+    "MissingExtraError",
+    "Model",
+    "Objective",
+    "Parameter",
+    "Plan",
+    "Propagator",
+    "Selection",
+    "SlotError",
+    "SolveError",
+    "State",
+    "SymgraphError",
+    "Tree",
+    "solve",
+    "unroll",
+]

@@ -1,0 +1,99 @@
+"""C source to a shared library in the user's cache: compiled once per source, compiler, flags and processor."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import platform
+import shutil
+import stat
+import subprocess
+import tempfile
+import warnings
+from functools import cache
+from pathlib import Path
+
+import platformdirs
+
+from symgraph.errors import CompileError
+
+# Strict IEEE arithmetic: NaN and infinity must survive to be noticed. errno and floating-point traps are what C has
+# to keep up for nobody here.
+FLAGS = ("-O2", "-fPIC", "-std=c99", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast")
+
+
+@cache
+def find_compiler() -> str | None:
+    """Return the path of the C compiler (CC, cc, gcc or clang), or None after one warning."""
+    for name in (os.environ.get("CC", ""), "cc", "gcc", "clang"):
+        path = shutil.which(name) if name else None
+        if path:
+            return path
+    warnings.warn(
+        "no C compiler found (CC, cc, gcc, clang): plans are computed in CasADi's interpreter, several times slower; "
+        "install one, e.g.  apt install gcc  or  xcode-select --install",
+        stacklevel=2,
+    )
+    return None
+
+
+def load(source: str, compiler: str) -> tuple[ctypes.CDLL, Path]:
+    """Compile C source, or find it compiled, and load it.
+
+    Raises:
+        CompileError: with what the compiler said.
+    """
+    folder = _private_folder()
+    key = hashlib.sha256("\0".join([source, *_identity(compiler), *FLAGS]).encode()).hexdigest()[:32]
+    path = folder / f"{key}.so"
+    if path.exists():
+        try:
+            return ctypes.CDLL(str(path)), path
+        except OSError:  # cut short by a full disk or a crash: make it anew
+            path.unlink(missing_ok=True)
+    _compile(source, compiler, path)
+    return ctypes.CDLL(str(path)), path
+
+
+def _compile(source: str, compiler: str, path: Path) -> None:
+    # Compiled in a folder of its own and moved into place at once, so that processes may race for it.
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        source_file, made = Path(folder, "kernel.c"), Path(folder, "kernel.so")
+        source_file.write_text(source)
+        command = [compiler, "-shared", *FLAGS, str(source_file), "-o", str(made), "-lm"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            raise CompileError(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")
+        os.replace(made, path)
+
+
+def _private_folder() -> Path:
+    """Return the cache folder if nobody else can write to it, else a new one for this process."""
+    folder = Path(platformdirs.user_cache_dir("symgraph")) / "kernels"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        info = folder.stat()
+        ours = not hasattr(os, "getuid") or info.st_uid == os.getuid()
+        if ours and not info.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and os.access(folder, os.W_OK):
+            return folder
+    except OSError:
+        pass
+    return _process_folder()
+
+
+@cache
+def _process_folder() -> Path:
+    return Path(tempfile.mkdtemp(prefix="symgraph-"))
+
+
+@cache
+def _identity(compiler: str) -> tuple[str, ...]:
+    """What besides the source decides whether a library runs here: -march=native code crashes on another processor."""
+    version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        processor = "\n".join(sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))}))
+    except OSError:
+        processor = platform.processor()
+    return compiler, version, platform.machine(), processor

@@ -1,0 +1,300 @@
+"""Objective: the expected sum of rewards of a tree, its value, gradient and Hessian in numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from symgraph.compile.kernel import Kernel, make_kernel
+from symgraph.errors import InputError, SlotError, did_you_mean, names
+from symgraph.expectation import Expectation, expected_value
+from symgraph.outcomes import NodeOutcomes, Outcomes
+from symgraph.slots import Action, Array, Gaussian, Selection, Slot, as_column
+from symgraph.tree import Tree
+
+
+class Build:
+    """All that is derived from the tree for one set of uncertain start states, each part when it is first needed."""
+
+    def __init__(self, tree: Tree, uncertain: frozenset[str], compiled: bool) -> None:
+        self._tree = tree
+        self._uncertain = uncertain
+        self._compiled = compiled
+        self._solvers: dict[tuple[int, float], ca.Function] = {}
+
+    @cached_property
+    def expectation(self) -> Expectation:
+        return expected_value(self._tree, self._uncertain)
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """inputs → J (1, 1), ∂J/∂actions (n, 1), in CasADi's interpreter."""
+        return self.expectation.value_and_gradient()
+
+    @cached_property
+    def hessian(self) -> ca.Function:
+        """inputs → ∂²J/∂actions² (n, n), in CasADi's interpreter."""
+        return self.expectation.hessian()
+
+    @cached_property
+    def kernel(self) -> Kernel:
+        """Value and gradient at many points, compiled where that is possible."""
+        return make_kernel(self.function, self._compiled)
+
+    @cached_property
+    def outcomes(self) -> Outcomes:
+        return Outcomes(self._tree, self._uncertain)
+
+    def ipopt(self, iterations: int, tolerance: float) -> ca.Function:
+        """Return IPOPT on −J over the actions; its parameters are the other inputs, stacked."""
+        if (iterations, tolerance) not in self._solvers:
+            expectation = self.expectation
+            actions, *others = expectation.inputs.symbols
+            problem = {"x": actions, "p": ca.veccat(*others), "f": -expectation.value}
+            options = {
+                "print_time": False,
+                "error_on_fail": False,
+                "show_eval_warnings": False,
+                "ipopt": {"print_level": 0, "sb": "yes", "max_iter": iterations, "tol": tolerance},
+            }
+            self._solvers[iterations, tolerance] = ca.nlpsol("ipopt", "ipopt", problem, options)
+        return self._solvers[iterations, tolerance]
+
+
+@dataclass(frozen=True)
+class Situation:
+    """A checked start state, ready to be evaluated: the objective's inputs but the actions and selections."""
+
+    given: dict[str, Gaussian]
+    build: Build
+    means: Array
+    covariances: Array
+
+    @property
+    def shared(self) -> list[Array]:
+        """The inputs after actions and selections, with the parameters' values of this moment."""
+        parameters = self.build.expectation.inputs.parameters
+        return [self.means, self.covariances, *(p.value.ravel(order="F") for p in parameters)]
+
+
+class Objective:
+    """The expected sum of rewards as ONE function of actions, selections, start states and model parameters.
+
+    J(actions, selections, state) = E[Σ rewards], equation (1) of the paper. Built at first use, once for each set of
+    start states that are uncertain; changed parameters and other numbers need no rebuild.
+
+    Args:
+        tree: what `unroll` returns.
+        compiled: evaluate many points in compiled C when there is a compiler; False stays in CasADi's interpreter.
+
+    Source: Yamaguchi & Atkeson, Humanoids 2016, sections II-A to II-C and III.
+    """
+
+    def __init__(self, tree: Tree, compiled: bool = True) -> None:
+        if not isinstance(tree, Tree):
+            raise InputError(f"Objective takes a tree, got {type(tree).__name__}; write Objective(unroll(graph))")
+        self.tree = tree
+        self.graph = tree.graph
+        self._compiled = compiled
+        self._builds: dict[frozenset[str], Build] = {}
+
+    def value(
+        self, state: Mapping[str, Any], actions: Mapping[str, Any] | None = None, selections: Mapping[str, str] | None = None
+    ) -> float:
+        """Return the expected sum of rewards.
+
+        Args:
+            state: label → number, array or Gaussian [unit], at least the states that some path reads before writing.
+            actions: label → number or array [unit], all of them; outside the bounds they are evaluated as they are.
+            selections: label → choice, all of them.
+
+        Raises:
+            InputError: something is missing, unknown, of the wrong size or not finite.
+        """
+        return float(self._evaluate(state, actions, selections)[0])
+
+    def gradient(
+        self, state: Mapping[str, Any], actions: Mapping[str, Any] | None = None, selections: Mapping[str, str] | None = None
+    ) -> dict[str, Any]:
+        """Return ∂J/∂action for each action label, a float for a scalar, else (size,) [reward/unit]; see `value`."""
+        return self.unstack(np.array(self._evaluate(state, actions, selections)[1]).ravel())
+
+    def hessian(
+        self, state: Mapping[str, Any], actions: Mapping[str, Any] | None = None, selections: Mapping[str, str] | None = None
+    ) -> Array:
+        """Return ∂²J/∂actions², (n, n) over the stacked actions in graph order; see `value`."""
+        situation = self.situation(state)
+        columns = [self.stack_actions(actions), self.one_hot(selections), *situation.shared]
+        return np.array(situation.build.hessian.call([ca.DM(c) for c in columns])[0])
+
+    def evaluate(
+        self, state: Mapping[str, Any], points: Any, selections: Mapping[str, str] | None = None
+    ) -> tuple[Array, Array]:
+        """Evaluate many points at once, side by side as columns.
+
+        Args:
+            state: as in `value`.
+            points: (n, P), the stacked actions in graph order, a column per point.
+            selections: label → choice, the same for all points.
+
+        Returns:
+            values (P,) and gradients (n, P).
+        """
+        situation = self.situation(state)
+        columns = np.asarray(points, dtype=float)
+        n = self.n_actions
+        if columns.ndim != 2 or columns.shape[0] != n:
+            raise InputError(f"points has shape {columns.shape}; give ({n}, P): the {n} stacked actions, a column per point")
+        chosen = np.tile(self.one_hot(selections), (columns.shape[1], 1))
+        values, gradients = situation.build.kernel(columns.T, chosen, situation.shared)
+        return values, gradients.T
+
+    def outcomes(
+        self, state: Mapping[str, Any], actions: Mapping[str, Any] | None = None, selections: Mapping[str, str] | None = None
+    ) -> NodeOutcomes:
+        """Return what happens at every node: probability, the slots' Gaussians, reward and value; see `value`."""
+        situation = self.situation(state)
+        columns = [self.stack_actions(actions), self.one_hot(selections), *situation.shared]
+        return situation.build.outcomes(columns, selections or {}, situation.given)
+
+    @cached_property
+    def n_actions(self) -> int:
+        """Number of stacked action elements."""
+        return sum(slot.size for slot in self.graph.actions().values())
+
+    @cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of the stacked actions, each (n,)."""
+        actions = self.graph.actions().values()
+        empty = [np.zeros(0)]
+        return np.concatenate([a.lower for a in actions] or empty), np.concatenate([a.upper for a in actions] or empty)
+
+    def situation(self, state: Mapping[str, Any]) -> Situation:
+        """Check a start state and find or begin the build for it.
+
+        Raises:
+            InputError: a label that is unknown or no state, a state that is missing, a value that does not fit.
+        """
+        if not isinstance(state, Mapping):
+            raise InputError(f"state is {type(state).__name__}; give {{label: number, array or Gaussian}}")
+        given = {label: self._gaussian(label, value) for label, value in state.items()}
+        missing = {label: place for label, place in self.tree.needed_states.items() if label not in given}
+        if missing:
+            label, place = next(iter(missing.items()))
+            others = f" Missing in all: {names(missing)}." if len(missing) > 1 else ""
+            hint = did_you_mean(label, [x for x in given if x not in self.tree.needed_states])
+            raise InputError(f"state {label!r} is missing: {place} reads it{hint}.{others}")
+        uncertain = frozenset(
+            label for label in self.tree.needed_states if isinstance(state[label], Gaussian)
+        )
+        if uncertain not in self._builds:
+            self._builds[uncertain] = Build(self.tree, uncertain, self._compiled)
+        empty = [np.zeros(0)]
+        spread = [label for label in self.tree.needed_states if label in uncertain]
+        means = [np.ravel(given[label].mean) for label in self.tree.needed_states]
+        return Situation(
+            given,
+            self._builds[uncertain],
+            np.concatenate(means or empty),
+            np.concatenate([np.ravel(given[label].covariance) for label in spread] or empty),
+        )
+
+    def stack_actions(self, actions: Mapping[str, Any] | None) -> Array:
+        """Stack {label: value} of all actions to (n,) in graph order."""
+        actions = actions or {}
+        slots = self.graph.actions()
+        self._check_labels(actions, slots, "action")
+        missing = [label for label in slots if label not in actions]
+        if missing:
+            raise InputError(f"action {missing[0]!r} is missing; give a value to each of {names(slots)}")
+        columns = [checked_column(value, slots[label].size, f"action {label!r}") for label, value in actions.items()]
+        by_label = dict(zip(actions, columns, strict=True))
+        return np.concatenate([by_label[label] for label in slots]) if slots else np.zeros(0)
+
+    def unstack(self, column: Array) -> dict[str, Any]:
+        """Split (n,) stacked actions into {label: float or (size,)}."""
+        parts, at = {}, 0
+        for label, slot in self.graph.actions().items():
+            part = column[at : at + slot.size]
+            parts[label] = float(part[0]) if slot.size == 1 else part.copy()
+            at += slot.size
+        return parts
+
+    def one_hot(self, selections: Mapping[str, str] | None) -> Array:
+        """Stack {label: choice} of all selections to one-hot columns (m,) in graph order."""
+        selections = selections or {}
+        slots = self.graph.selections()
+        self._check_labels(selections, slots, "selection")
+        missing = [label for label in slots if label not in selections]
+        if missing:
+            choices = names(slots[missing[0]].choices)
+            raise InputError(f"selection {missing[0]!r} is missing; give one of its choices: {choices}")
+        for label, choice in selections.items():
+            check_choice(label, choice, slots[label])
+        hot = [float(choice == selections[label]) for label, slot in slots.items() for choice in slot.choices]
+        return np.array(hot)
+
+    def _evaluate(
+        self, state: Mapping[str, Any], actions: Mapping[str, Any] | None, selections: Mapping[str, str] | None
+    ) -> list[ca.DM]:
+        situation = self.situation(state)
+        columns = [self.stack_actions(actions), self.one_hot(selections), *situation.shared]
+        results: list[ca.DM] = situation.build.function.call([ca.DM(c) for c in columns])
+        return results
+
+    def _gaussian(self, label: str, value: Any) -> Gaussian:
+        slots = self.graph.slots
+        slot = slots.get(label)
+        if slot is None:
+            raise InputError(f"state {label!r} is not a slot{did_you_mean(label, slots)}. States: {names(self.graph.states())}")
+        if isinstance(slot, Action):
+            raise InputError(f"{label!r} is an action, not a state: the planner chooses it; to hold it give fixed={{{label!r}: …}}")
+        if isinstance(slot, Selection):
+            raise InputError(f"{label!r} is a selection, not a state: give it as selections= or fixed=")
+        if isinstance(value, Gaussian):
+            if np.size(value.mean) != slot.size:
+                raise InputError(f"state {label!r}: the mean has {np.size(value.mean)} elements, the slot {slot.size}")
+            return value
+        column = checked_column(value, slot.size, f"state {label!r}")
+        return Gaussian(column, np.zeros((slot.size, slot.size)))
+
+    def _check_labels(self, given: Mapping[str, Any], slots: Mapping[str, Slot], kind: str) -> None:
+        if not isinstance(given, Mapping):
+            raise InputError(f"{kind}s is {type(given).__name__}; give {{label: value}}")
+        for label in given:
+            if label not in slots:
+                raise InputError(f"{label!r} is no {kind}{did_you_mean(str(label), slots)}. {kind.capitalize()}s: {names(slots)}")
+
+
+def checked_column(value: Any, size: int, place: str) -> Array:
+    """Turn a number or array into a finite (size,) array; raise InputError naming the place otherwise."""
+    try:
+        column = as_column(value, place)
+    except SlotError as error:
+        raise InputError(str(error)) from None
+    if column.size != size:
+        raise InputError(f"{place} has {column.size} elements, the slot has {size}")
+    return column
+
+
+def check_choice(label: str, choice: Any, slot: Selection) -> None:
+    """Raise InputError when a choice is none of the selection's."""
+    if choice not in slot.choices:
+        hint = did_you_mean(str(choice), slot.choices)
+        raise InputError(f"selection {label!r}: {choice!r} is not a choice{hint}. Choices: {names(slot.choices)}")
+
+
+def stacked_index(slots: Mapping[str, Slot]) -> dict[str, slice]:
+    """Return where each label stands in the stacked column."""
+    where, at = {}, 0
+    for label, slot in slots.items():
+        where[label] = slice(at, at + slot.size)
+        at += slot.size
+    return where
+
+

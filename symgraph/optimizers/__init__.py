@@ -1,0 +1,8 @@
+"""Ways to find good actions and selections, one a file, behind one small abstract class."""
+
+from symgraph.optimizers.adadelta import Adadelta
+from symgraph.optimizers.ipopt import Ipopt
+from symgraph.optimizers.lbfgs import Lbfgs
+from symgraph.optimizers.problem import Evaluator, Optimizer, Problem, Run, Search
+
+__all__ = ["Adadelta", "Evaluator", "Ipopt", "Lbfgs", "Optimizer", "Problem", "Run", "Search"]

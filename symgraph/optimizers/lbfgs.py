@@ -1,0 +1,85 @@
+"""Multi-start L-BFGS: sample widely, climb from the most promising samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from symgraph.errors import InputError
+from symgraph.optimizers.climb import climb
+from symgraph.optimizers.problem import Choices, Optimizer, Problem, Search
+from symgraph.slots import Array
+
+
+@dataclass(frozen=True)
+class Lbfgs(Optimizer):
+    """Multi-start L-BFGS within the bounds; the default of `solve`.
+
+    For each combination of selections, `samples` points are spread over the bounds and evaluated; of the better half,
+    those farthest from any better one are climbed from, since they most likely lead to other maxima. Where there are
+    more combinations than `starts`, a random part of them is tried.
+
+    Args:
+        starts: points climbed from, shared evenly by the combinations of selections (at least one each).
+        samples: points evaluated per start.
+        iterations: gradient evaluations of one climb at most.
+        tolerance: largest element of the projected gradient, per range and relative to 1 + |J|, that is converged.
+
+    Source: Liu & Nocedal 1989 (L-BFGS); the choice of start points after Rinnooy Kan & Timmer 1987.
+    """
+
+    starts: int = 16
+    samples: int = 8
+    iterations: int = 500
+    tolerance: float = 1e-9
+
+    def __post_init__(self) -> None:
+        for name in ("starts", "samples", "iterations"):
+            positive_whole(name, getattr(self, name), "Lbfgs")
+
+    def run(self, problem: Problem, rng: np.random.Generator) -> Search:
+        points, choices = promising_points(problem, rng, self.starts, self.samples)
+        if problem.guesses:
+            guessed, guessed_choices = problem.started_from_guesses(rng)
+            points, choices = np.concatenate([guessed, points]), np.concatenate([guessed_choices, choices])
+        runs = climb(
+            problem,
+            points,
+            choices,
+            self.iterations,
+            self.tolerance,
+            report=lambda passes: problem.progress.update(passes, self.iterations),
+        )
+        stopped = sum(run.outcome == "interrupted" for run in runs)
+        return Search(runs, f"best of {len(runs)} starts", interrupted=stopped > 0)
+
+
+def promising_points(problem: Problem, rng: np.random.Generator, starts: int, samples: int) -> tuple[Array, Choices]:
+    """Return start points (P, n) and their choices (P, s): the most promising of samples spread over the bounds."""
+    each = max(1, starts // problem.combinations)
+    groups = problem.draw_choices(rng, min(problem.combinations, starts), evenly=True)
+    count = max(2, each * samples) if problem.n else 1
+    points = np.concatenate([problem.draw_points(rng, count, "spread") for _ in groups])
+    choices = np.repeat(groups, count, axis=0)
+    values, _ = problem.evaluate(points, choices)
+    kept = []
+    for k in range(len(groups)):
+        block = np.arange(k * count, (k + 1) * count)
+        kept += [block[i] for i in _peaks((points[block] - problem.low) / (problem.high - problem.low), values[block], each)]
+    return points[kept], choices[kept]
+
+
+def _peaks(unit: Array, values: Array, count: int) -> list[int]:
+    """Return the indices of the best sample and of those in the better half that lie farthest from any better one."""
+    order = np.argsort(-values, kind="stable")[: max(count, (len(values) + 1) // 2)]
+    distances = np.linalg.norm(unit[order][:, None] - unit[order][None], axis=2)
+    to_better = [np.inf] + [distances[i, :i].min() for i in range(1, len(order))]
+    ranked = sorted(range(len(order)), key=lambda i: -to_better[i])
+    return [int(order[i]) for i in ranked[:count]]
+
+
+def positive_whole(name: str, value: object, owner: str) -> None:
+    """Raise InputError unless the setting is a positive whole number."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise InputError(f"{owner}: {name} = {value!r}; give a positive whole number")

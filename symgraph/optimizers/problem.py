@@ -1,0 +1,195 @@
+"""What an optimizer sees of a task: a box of actions, choices of selections, values and gradients; and what it returns."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from symgraph.compile.kernel import Kernel
+from symgraph.objective import Situation
+from symgraph.progress import Progress
+from symgraph.slots import Array
+
+Choices = npt.NDArray[np.int64]  # (P, number of selections): which choice of each selection, a row per point
+Outcome = Literal["converged", "iteration limit", "oscillation", "stalled", "not finite", "worker died", "interrupted"]
+
+
+@dataclass(frozen=True)
+class Evaluator:
+    """Values and gradients over the free actions; small enough to be sent to other processes.
+
+    Attributes:
+        kernel: the objective's value and gradient.
+        shared: the kernel's inputs after actions and selections.
+        template: (n_all,) all actions, the held ones at their value.
+        free: indices into it of the actions that are not held.
+        sizes: number of choices of each selection.
+    """
+
+    kernel: Kernel
+    shared: tuple[Array, ...]
+    template: Array
+    free: npt.NDArray[np.int64]
+    sizes: tuple[int, ...]
+
+    def __call__(self, points: Array, choices: Choices) -> tuple[Array, Array]:
+        """Evaluate points (P, n) under choices (P, s).
+
+        Returns:
+            values (P,), -inf where value or gradient are not finite, and gradients (P, n), 0 there.
+        """
+        actions = self.complete(points)
+        values, gradients = self.kernel(actions, self.one_hot(choices), self.shared)
+        if self.free.size < self.template.size:
+            gradients = gradients[:, self.free]
+        bad = ~(np.isfinite(values) & np.isfinite(gradients).all(axis=1))
+        if bad.any():
+            values[bad] = -np.inf
+            gradients[bad] = 0.0
+        return values, gradients
+
+    def complete(self, points: Array) -> Array:
+        """Return (P, n_all) actions, the held ones included."""
+        if self.free.size == self.template.size:
+            return points
+        actions = np.tile(self.template, (len(points), 1))
+        actions[:, self.free] = points
+        return actions
+
+    def one_hot(self, choices: Choices) -> Array:
+        """Return (P, Σ sizes) one-hot rows."""
+        hot = np.zeros((len(choices), sum(self.sizes)))
+        rows = np.arange(len(choices))
+        offset = 0
+        for s, size in enumerate(self.sizes):
+            hot[rows, offset + choices[:, s]] = 1.0
+            offset += size
+        return hot
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Maximise the evaluator's value over a box of free actions and the allowed choices.
+
+    Attributes:
+        evaluate: values and gradients.
+        situation: the checked start state, with the symbolic expression behind it.
+        low, high: (n,) bounds of the free actions.
+        allowed: for each selection, the choices that are not ruled out.
+        guesses: start points from the user, each (n,) actions (NaN: not given) and (s,) choices (-1: not given).
+        progress: to report to.
+    """
+
+    evaluate: Evaluator
+    situation: Situation
+    low: Array
+    high: Array
+    allowed: tuple[tuple[int, ...], ...]
+    guesses: tuple[tuple[Array, Choices], ...] = ()
+    progress: Progress = field(default_factory=lambda: Progress("planning", shown=False))
+
+    @property
+    def n(self) -> int:
+        return self.low.size
+
+    @property
+    def combinations(self) -> int:
+        """Number of combinations of allowed choices."""
+        return math.prod(len(choices) for choices in self.allowed)
+
+    def draw_choices(self, rng: np.random.Generator, count: int, evenly: bool) -> Choices:
+        """Draw choices (count, s): evenly over the combinations, or independently and uniformly."""
+        if not evenly or self.combinations > 10**9:
+            columns = [rng.choice(choices, size=count) for choices in self.allowed]
+            return np.array(columns, dtype=np.int64).reshape(len(self.allowed), count).T
+        repeats, rest = divmod(count, self.combinations)
+        partial = rng.choice(self.combinations, size=rest, replace=False) if rest else np.zeros(0, dtype=np.int64)
+        codes = np.concatenate([np.tile(np.arange(self.combinations), repeats), partial]) if repeats else partial
+        return self.decode(codes)
+
+    def decode(self, codes: npt.NDArray[np.int64]) -> Choices:
+        """Turn numbers in [0, combinations) into choices (P, s)."""
+        choices = np.zeros((len(codes), len(self.allowed)), dtype=np.int64)
+        for s, allowed in enumerate(self.allowed):
+            codes, digit = np.divmod(codes, len(allowed))
+            choices[:, s] = np.asarray(allowed)[digit]
+        return choices
+
+    def draw_points(self, rng: np.random.Generator, count: int, sampling: str) -> Array:
+        """Draw points (count, n).
+
+        Args:
+            rng: source of randomness.
+            count: how many.
+            sampling: "uniform"; "gaussian", around the middle with a quarter of the range as standard deviation,
+                clipped; or "spread", a Latin hypercube (McKay, Beckman & Conover 1979).
+        """
+        if sampling == "gaussian":
+            points = (self.low + self.high) / 2 + (self.high - self.low) / 4 * rng.standard_normal((count, self.n))
+            return np.clip(points, self.low, self.high)
+        unit = rng.random((count, self.n))
+        if sampling == "spread":
+            ranks = rng.permuted(np.tile(np.arange(count)[:, None], (1, self.n)), axis=0)
+            unit = (ranks + unit) / count
+        return self.low + (self.high - self.low) * unit
+
+    def started_from_guesses(self, rng: np.random.Generator) -> tuple[Array, Choices]:
+        """Return the guesses as points (P, n) and choices (P, s), what they leave out drawn at random."""
+        count = len(self.guesses)
+        points, choices = self.draw_points(rng, count, "uniform"), self.draw_choices(rng, count, evenly=False)
+        for i, (point, choice) in enumerate(self.guesses):
+            points[i] = np.where(np.isnan(point), points[i], np.clip(point, self.low, self.high))
+            choices[i] = np.where(choice < 0, choices[i], choice)
+        return points, choices
+
+
+@dataclass
+class Run:
+    """What became of one start point.
+
+    Attributes:
+        start: (n,) free actions at the start.
+        point: (n,) free actions at the end.
+        choices: (s,) the selections, which a run keeps.
+        value: the expected reward at `point`.
+        outcome: why it ended.
+        iterations: gradient evaluations spent on it.
+        history: the values on the way.
+    """
+
+    start: Array
+    point: Array
+    choices: Choices
+    value: float
+    outcome: Outcome
+    iterations: int
+    history: list[float] = field(default_factory=list)
+
+
+@dataclass
+class Search:
+    """All runs of an optimizer and, where it was cut short, what cut it short."""
+
+    runs: list[Run]
+    status: str
+    interrupted: bool = False
+
+
+class Optimizer(ABC):
+    """A way to find good actions and selections: one method, from a problem to its runs."""
+
+    @abstractmethod
+    def run(self, problem: Problem, rng: np.random.Generator) -> Search:
+        """Search for the maximum; a KeyboardInterrupt ends it with the runs so far."""
+
+
+def best_of(runs: Sequence[Run]) -> Run | None:
+    """Return the run with the highest finite value, the first of equals."""
+    finite = [run for run in runs if np.isfinite(run.value)]
+    return max(finite, key=lambda run: run.value) if finite else None

@@ -1,0 +1,165 @@
+"""Plan: the best actions and selections found, what they lead to, and how they were found."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from symgraph.drawing import Diagram
+from symgraph.errors import GraphError
+from symgraph.outcomes import NodeOutcome, NodeOutcomes
+from symgraph.slots import Gaussian
+
+SHOWN_NODES = 12  # nodes that a printed plan lists
+
+
+@dataclass(frozen=True)
+class PlanRun:
+    """What became of one start point.
+
+    Attributes:
+        selections: {label: choice}, which a run keeps.
+        start, actions: {label: value} at the start and at the end [unit].
+        value: expected reward at the end; -inf where nothing finite was met.
+        outcome: "converged", "iteration limit", "oscillation", "stalled" (no step gains any more), "not finite",
+            "worker died" or "interrupted".
+        iterations: gradient evaluations.
+        history: the values on the way.
+    """
+
+    selections: dict[str, str]
+    start: dict[str, Any]
+    actions: dict[str, Any]
+    value: float
+    outcome: str
+    iterations: int
+    history: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The best actions and selections that were found.
+
+    Attributes:
+        actions: {label: float or (size,)} [unit].
+        selections: {label: choice}.
+        value: the expected sum of rewards.
+        status: what is known: "converged", "best of N starts", "interrupted: …".
+        notes: what makes the value less than it seems, e.g. paths that are cut.
+        nodes: the outcome at every tree node, in tree order.
+        runs: a row per start point.
+        optimizer, seed: how it was found.
+        seconds: wall time of the search [s].
+        units: {label: unit} of the actions and states that have one.
+    """
+
+    actions: dict[str, Any]
+    selections: dict[str, str]
+    value: float
+    status: str
+    notes: tuple[str, ...]
+    nodes: Sequence[NodeOutcome]
+    runs: Sequence[PlanRun]
+    optimizer: str
+    seed: int
+    seconds: float
+    units: Mapping[str, str]
+
+    def __str__(self) -> str:
+        lines = [f"{label} = {choice}" for label, choice in self.selections.items()]
+        lines += [f"{label} = {self._quantity(label, value)}" for label, value in self.actions.items()]
+        gradients = sum(run.iterations for run in self.runs)
+        lines.append(f"value {self.value:.6g}: {self.status}")
+        lines.append(f"  {gradients} gradients in {1e3 * self.seconds:.1f} ms by {self.optimizer}, seed {self.seed}")
+        lines += [f"  note: {note}" for note in self.notes]
+        reached = [node for node in self.nodes if node.probability > 0.0]
+        for node in reached[:SHOWN_NODES]:
+            reward = f", reward {node.reward:.4g}" if node.reward else ""
+            lines.append(f"  {node.path}: probability {node.probability:.3g}{reward}{' (cut)' if node.cut else ''}")
+        if len(reached) > SHOWN_NODES:
+            lines.append(f"  … and {len(reached) - SHOWN_NODES} more nodes")
+        return "\n".join(lines)
+
+    def _quantity(self, label: str, value: Any) -> str:
+        numbers = ", ".join(f"{x:.5g}" for x in np.ravel(value))
+        return " ".join(part for part in (f"[{numbers}]" if np.ndim(value) else numbers, self.units.get(label, "")) if part)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the plan as dictionaries, lists, strings and numbers, fit for JSON."""
+        return {
+            "actions": _plain(self.actions),
+            "selections": dict(self.selections),
+            "value": self.value,
+            "status": self.status,
+            "notes": list(self.notes),
+            "nodes": [
+                {
+                    "path": node.path,
+                    "node": node.node,
+                    "probability": node.probability,
+                    "reward": node.reward,
+                    "value": node.value,
+                    "cut": node.cut,
+                    "states": {label: _plain(gaussian) for label, gaussian in node.states.items()},
+                }
+                for node in self.nodes
+            ],
+            "runs": [
+                {
+                    "selections": dict(run.selections),
+                    "start": _plain(run.start),
+                    "actions": _plain(run.actions),
+                    "value": run.value,
+                    "outcome": run.outcome,
+                    "iterations": run.iterations,
+                    "history": list(run.history),
+                }
+                for run in self.runs
+            ],
+            "optimizer": self.optimizer,
+            "seed": self.seed,
+            "seconds": self.seconds,
+            "units": dict(self.units),
+        }
+
+    def to_json(self, indent: int | None = 2) -> str:
+        """Return the plan as JSON; numbers that are not finite become null, since JSON has none."""
+        return json.dumps(_finite(self.to_dict()), indent=indent)
+
+    def diagram(self) -> Diagram:
+        """Return the picture of the tree with probabilities and expected values; unselected branches are pale.
+
+        Raises:
+            GraphError: the plan comes from another process and left its tree there.
+        """
+        if not isinstance(self.nodes, NodeOutcomes):
+            raise GraphError("this plan came from another process without its tree; draw it where it was made")
+        notes = {}
+        for i, node in enumerate(self.nodes):
+            if node.probability:
+                notes[i] = (f"p = {node.probability:.3g}", f"J = {node.value:.4g}")
+        reach = {i: float(p) for i, p in enumerate(self.nodes.probabilities)}
+        return self.nodes.tree.diagram(notes, reach)
+
+    def _repr_svg_(self) -> str | None:
+        return self.diagram().svg() if isinstance(self.nodes, NodeOutcomes) else None
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {label: _plain(item) for label, item in value.items()}
+    if isinstance(value, Gaussian):
+        return {"mean": _plain(value.mean), "covariance": _plain(value.covariance)}
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {label: _finite(item) for label, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -1,0 +1,229 @@
+"""solve: from an objective and a state to a plan."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, overload
+
+import numpy as np
+
+from symgraph.errors import InputError, SolveError, did_you_mean, names
+from symgraph.objective import Objective, Situation, check_choice, checked_column, stacked_index
+from symgraph.optimizers.lbfgs import Lbfgs
+from symgraph.optimizers.problem import Evaluator, Optimizer, Problem, Run, Search, best_of
+from symgraph.plan import Plan, PlanRun
+from symgraph.progress import Progress
+from symgraph.slots import Action, Selection
+
+Guess = Plan | Mapping[str, Any]
+
+
+def solve(
+    objective: Objective,
+    state: Mapping[str, Any],
+    optimizer: Optimizer | None = None,
+    *,
+    guess: Guess | Sequence[Guess] | None = None,
+    fixed: Mapping[str, Any] | None = None,
+    seed: int = 0,
+    progress: bool = True,
+) -> Plan:
+    """Find the actions and selections with the highest expected sum of rewards.
+
+    The first call compiles the objective (a fraction of a second to a minute, kept on disk); later ones only search.
+
+    Args:
+        objective: what to maximise.
+        state: label → number, array or Gaussian [unit], as in `Objective.value`.
+        optimizer: `Lbfgs()` if left out: it finds the best plan soonest; `Adadelta()`, `Ipopt()`, … otherwise.
+        guess: start points to add: a plan, {label: value} of some actions and selections, or a list of them.
+        fixed: {label: value} of actions and selections that are held.
+        seed: of all that is random; the same seed gives the same plan.
+        progress: show a progress bar where it takes longer than two seconds.
+
+    Raises:
+        InputError: a state, guess or fixed value that does not fit.
+        SolveError: no start point led to a finite value.
+    """
+    if not isinstance(objective, Objective):
+        raise InputError(f"solve takes an Objective, got {type(objective).__name__}; write Objective(unroll(graph))")
+    optimizer = Lbfgs() if optimizer is None else optimizer
+    if not isinstance(optimizer, Optimizer):
+        raise InputError(f"optimizer is {optimizer!r}; give one, e.g. Lbfgs(), with its parentheses")
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise InputError(f"seed = {seed!r}; give a whole number of at least 0")
+    begin = time.perf_counter()
+    situation = objective.situation(state)
+    with Progress("planning", progress) as bar:
+        problem = _problem(objective, situation, guess, fixed or {}, bar)
+        search = optimizer.run(problem, np.random.default_rng(seed))
+    best = best_of(search.runs)
+    if best is None:
+        if search.interrupted:
+            raise KeyboardInterrupt
+        raise SolveError(_why_not_finite(objective, situation, problem, search))
+    actions = objective.unstack(problem.evaluate.complete(best.point[None])[0])
+    selections = _selections(objective, best)
+    columns = [objective.stack_actions(actions), objective.one_hot(selections), *problem.evaluate.shared]
+    nodes = situation.build.outcomes(columns, selections, situation.given)
+    return Plan(
+        actions=actions,
+        selections=selections,
+        value=best.value,
+        status=f"interrupted: best of {len(search.runs)} runs" if search.interrupted else search.status,
+        notes=tuple(nodes.notes()),
+        nodes=nodes,
+        runs=_Runs(objective, problem.evaluate, search.runs),
+        optimizer=type(optimizer).__name__,
+        seed=int(seed),
+        seconds=time.perf_counter() - begin,
+        units={label: slot.unit for label, slot in objective.graph.slots.items() if getattr(slot, "unit", "")},
+    )
+
+
+def _problem(
+    objective: Objective,
+    situation: Situation,
+    guess: Guess | Sequence[Guess] | None,
+    fixed: Mapping[str, Any],
+    progress: Progress,
+) -> Problem:
+    actions, selections = objective.graph.actions(), objective.graph.selections()
+    low, high = objective.bounds
+    where = stacked_index(actions)
+    template = low.copy()
+    held = low == high  # an action without room is held, so that no range is zero
+    allowed = {label: tuple(range(slot.size)) for label, slot in selections.items()}
+    for label, value in fixed.items():
+        slot = _planned_slot(objective, label, "fixed")
+        if isinstance(slot, Action):
+            template[where[label]] = checked_column(value, slot.size, f"fixed action {label!r}")
+            held[where[label]] = True
+        else:
+            check_choice(label, value, slot)
+            allowed[label] = (slot.choices.index(value),)
+    free = np.flatnonzero(~held)
+    progress.wait("compiling")
+    evaluate = Evaluator(
+        kernel=situation.build.kernel,
+        shared=tuple(situation.shared),
+        template=template,
+        free=free,
+        sizes=tuple(slot.size for slot in selections.values()),
+    )
+    progress.wait("planning")
+    return Problem(
+        evaluate=evaluate,
+        situation=situation,
+        low=low[free],
+        high=high[free],
+        allowed=tuple(allowed.values()),
+        guesses=tuple(_guess(objective, one, free, allowed) for one in _listed(guess)),
+        progress=progress,
+    )
+
+
+def _listed(guess: Guess | Sequence[Guess] | None) -> list[Guess]:
+    if guess is None:
+        return []
+    if isinstance(guess, (Plan, Mapping)):
+        return [guess]
+    if isinstance(guess, Sequence) and all(isinstance(one, (Plan, Mapping)) for one in guess):
+        return list(guess)
+    raise InputError(f"guess is {guess!r}; give a plan, {{label: value}}, or a list of them")
+
+
+def _guess(objective: Objective, guess: Guess, free: Any, allowed: Mapping[str, tuple[int, ...]]) -> tuple[Any, Any]:
+    """Turn a guess into free actions (n,), NaN where left out, and choices (s,), -1 where left out or ruled out."""
+    values = {**guess.actions, **guess.selections} if isinstance(guess, Plan) else guess
+    where = stacked_index(objective.graph.actions())
+    point = np.full(objective.n_actions, np.nan)
+    choices = dict.fromkeys(allowed, -1)
+    for label, value in values.items():
+        slot = _planned_slot(objective, label, "guess")
+        if isinstance(slot, Action):
+            point[where[label]] = checked_column(value, slot.size, f"guess for action {label!r}")
+        else:
+            check_choice(label, value, slot)
+            choice = slot.choices.index(value)
+            choices[label] = choice if choice in allowed[label] else -1
+    return point[free], np.array(list(choices.values()), dtype=np.int64)
+
+
+def _planned_slot(objective: Objective, label: str, place: str) -> Action | Selection:
+    slots = objective.graph.slots
+    slot = slots.get(label)
+    if isinstance(slot, (Action, Selection)):
+        return slot
+    planned = [name for name, s in slots.items() if isinstance(s, (Action, Selection))]
+    if slot is not None:
+        raise InputError(f"{place}: {label!r} is a state; give it in the state. Actions and selections: {names(planned)}")
+    hint = did_you_mean(str(label), planned)
+    raise InputError(f"{place}: {label!r} is no action or selection{hint}. Actions and selections: {names(planned)}")
+
+
+def _selections(objective: Objective, run: Run) -> dict[str, str]:
+    slots = objective.graph.selections().items()
+    return {label: slot.choices[int(c)] for (label, slot), c in zip(slots, run.choices, strict=True)}
+
+
+def _why_not_finite(objective: Objective, situation: Situation, problem: Problem, search: Search) -> str:
+    """Say where the first start point stopped being finite."""
+    died = sum(run.outcome == "worker died" for run in search.runs)
+    if not search.runs or died == len(search.runs):
+        return f"no start point was finished: {search.status}; {died} runs were lost with their worker processes"
+    run = search.runs[0]
+    actions = objective.unstack(problem.evaluate.complete(run.start[None])[0])
+    selections = _selections(objective, run)
+    columns = [objective.stack_actions(actions), objective.one_hot(selections), *problem.evaluate.shared]
+    at = f"at actions {actions}, selections {selections}"
+    for node in situation.build.outcomes(columns, selections, situation.given):
+        if not node.probability:
+            continue
+        for label, gaussian in node.states.items():
+            if not (np.isfinite(gaussian.mean).all() and np.isfinite(gaussian.covariance).all()):
+                return f"no start point has a finite value: {label!r} is {gaussian} on the path {node.path!r} {at}"
+        if not np.isfinite(node.reward):
+            return f"no start point has a finite value: the reward is {node.reward} on the path {node.path!r} {at}"
+    return f"no start point has a finite value or gradient, e.g. {at}; look for square roots and divisions at 0"
+
+
+class _Runs(Sequence[PlanRun]):
+    """The runs by labels; each row is made when it is looked at."""
+
+    def __init__(self, objective: Objective, evaluate: Evaluator, runs: list[Run]) -> None:
+        self._objective = objective
+        self._evaluate = evaluate
+        self._runs = runs
+
+    def __len__(self) -> int:
+        return len(self._runs)
+
+    @overload
+    def __getitem__(self, index: int) -> PlanRun: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[PlanRun]: ...
+    def __getitem__(self, index: int | slice) -> PlanRun | list[PlanRun]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        run = self._runs[index]
+        start, end = self._evaluate.complete(np.array([run.start, run.point]))
+        return PlanRun(
+            selections=_selections(self._objective, run),
+            start=self._objective.unstack(start),
+            actions=self._objective.unstack(end),
+            value=run.value,
+            outcome=run.outcome,
+            iterations=run.iterations,
+            history=tuple(run.history),
+        )
+
+    def __iter__(self) -> Iterator[PlanRun]:
+        return (self[i] for i in range(len(self)))
+
+    def __reduce__(self) -> tuple[Any, ...]:  # an objective holds the user's functions, which need not pickle
+        return tuple, (list(self),)
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} runs>"
