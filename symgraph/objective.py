@@ -10,11 +10,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from symgraph.compile.interpreted import FlatFunction
 from symgraph.compile.kernel import Kernel, make_kernel
 from symgraph.errors import InputError, SlotError, did_you_mean, names
 from symgraph.expectation import Expectation, expected_value
 from symgraph.outcomes import NodeOutcomes, Outcomes
-from symgraph.slots import Action, Array, Gaussian, Selection, Slot, as_column
+from symgraph.slots import Action, Array, Gaussian, Selection, Slot, as_column, unchecked_gaussian
 from symgraph.tree import Tree
 
 
@@ -33,18 +34,27 @@ class Build:
 
     @cached_property
     def function(self) -> ca.Function:
-        """inputs → J (1, 1), ∂J/∂actions (n, 1), in CasADi's interpreter."""
+        """inputs → J (1, 1), ∂J/∂actions (n, 1)."""
         return self.expectation.value_and_gradient()
 
     @cached_property
-    def hessian(self) -> ca.Function:
+    def interpreted(self) -> FlatFunction:
+        """The same in CasADi's interpreter, for single points."""
+        return FlatFunction(self.function)
+
+    @cached_property
+    def hessian(self) -> FlatFunction:
         """inputs → ∂²J/∂actions² (n, n), in CasADi's interpreter."""
-        return self.expectation.hessian()
+        return FlatFunction(self.expectation.hessian())
 
     @cached_property
     def kernel(self) -> Kernel:
         """Value and gradient at many points, compiled where that is possible."""
         return make_kernel(self.function, self._compiled)
+
+    @property
+    def has_kernel(self) -> bool:
+        return "kernel" in self.__dict__
 
     @cached_property
     def outcomes(self) -> Outcomes:
@@ -116,13 +126,13 @@ class Objective:
         Raises:
             InputError: something is missing, unknown, of the wrong size or not finite.
         """
-        return float(self._evaluate(state, actions, selections)[0])
+        return float(self._evaluate(state, actions, selections)[0][0])
 
     def gradient(
         self, state: Mapping[str, Any], actions: Mapping[str, Any] | None = None, selections: Mapping[str, str] | None = None
     ) -> dict[str, Any]:
         """Return ∂J/∂action for each action label, a float for a scalar, else (size,) [reward/unit]; see `value`."""
-        return self.unstack(np.array(self._evaluate(state, actions, selections)[1]).ravel())
+        return self.unstack(self._evaluate(state, actions, selections)[1])
 
     def hessian(
         self, state: Mapping[str, Any], actions: Mapping[str, Any] | None = None, selections: Mapping[str, str] | None = None
@@ -130,7 +140,7 @@ class Objective:
         """Return ∂²J/∂actions², (n, n) over the stacked actions in graph order; see `value`."""
         situation = self.situation(state)
         columns = [self.stack_actions(actions), self.one_hot(selections), *situation.shared]
-        return np.array(situation.build.hessian.call([ca.DM(c) for c in columns])[0])
+        return situation.build.hessian(columns)[0].reshape(self.n_actions, self.n_actions)
 
     def evaluate(
         self, state: Mapping[str, Any], points: Any, selections: Mapping[str, str] | None = None
@@ -151,7 +161,7 @@ class Objective:
         if columns.ndim != 2 or columns.shape[0] != n:
             raise InputError(f"points has shape {columns.shape}; give ({n}, P): the {n} stacked actions, a column per point")
         chosen = np.tile(self.one_hot(selections), (columns.shape[1], 1))
-        values, gradients = situation.build.kernel(columns.T, chosen, situation.shared)
+        values, gradients = situation.build.kernel.bind(situation.shared).evaluate(columns.T, chosen)
         return values, gradients.T
 
     def outcomes(
@@ -241,11 +251,10 @@ class Objective:
 
     def _evaluate(
         self, state: Mapping[str, Any], actions: Mapping[str, Any] | None, selections: Mapping[str, str] | None
-    ) -> list[ca.DM]:
+    ) -> list[Array]:
         situation = self.situation(state)
         columns = [self.stack_actions(actions), self.one_hot(selections), *situation.shared]
-        results: list[ca.DM] = situation.build.function.call([ca.DM(c) for c in columns])
-        return results
+        return situation.build.interpreted(columns)
 
     def _gaussian(self, label: str, value: Any) -> Gaussian:
         slots = self.graph.slots
@@ -261,7 +270,7 @@ class Objective:
                 raise InputError(f"state {label!r}: the mean has {np.size(value.mean)} elements, the slot {slot.size}")
             return value
         column = checked_column(value, slot.size, f"state {label!r}")
-        return Gaussian(column, np.zeros((slot.size, slot.size)))
+        return unchecked_gaussian(column, np.zeros((slot.size, slot.size)))
 
     def _check_labels(self, given: Mapping[str, Any], slots: Mapping[str, Slot], kind: str) -> None:
         if not isinstance(given, Mapping):

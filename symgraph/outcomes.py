@@ -10,9 +10,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from symgraph.compile.interpreted import FlatFunction
 from symgraph.expectation import Dictionary, Inputs
 from symgraph.model import REWARD, BoundModel
-from symgraph.slots import Array, Gaussian
+from symgraph.slots import Array, Gaussian, unchecked_gaussian
 from symgraph.tree import Tree
 
 
@@ -89,7 +90,7 @@ class Outcomes:
                     new = {label: self._state(g, put) for label, g in written.items()}
                     waiting[tree_branch.child] = {**here, **written}, {**layout, **new}
             self._layouts.append(_Layout(layout, tuple(rewards), shares))
-        self._function = ca.Function("outcomes", inputs.symbols, [ca.vertcat(*pieces)])
+        self._function = FlatFunction(ca.Function("outcomes", inputs.symbols, [ca.vertcat(*pieces)]))
         # Which start states the expression does not know: given, but written before they are read, or never read.
         self._root_states = frozenset(states)
 
@@ -108,7 +109,7 @@ class Outcomes:
             selections: {label: choice}.
             given: all start states, those too that nothing reads.
         """
-        flat = np.array(self._function.call([ca.DM(c) for c in columns])[0]).ravel()
+        flat = self._function(columns)[0]
         extra = {label: gaussian for label, gaussian in given.items() if label not in self._root_states}
         return NodeOutcomes(self.tree, tuple(self._layouts), flat, dict(selections), extra)
 
@@ -221,12 +222,3 @@ class NodeOutcomes(Sequence[NodeOutcome]):
                 f"as {self.tree.cut_value:g} from there (unroll with more max_visits, or another cut_value)"
             )
         return found
-
-
-def unchecked_gaussian(mean: Array, covariance: Array) -> Gaussian:
-    """Make a Gaussian of computed numbers, which may be NaN or indefinite by rounding."""
-    gaussian = Gaussian.__new__(Gaussian)
-    scalar = mean.size == 1
-    object.__setattr__(gaussian, "mean", float(mean[0]) if scalar else mean.copy())
-    object.__setattr__(gaussian, "covariance", float(covariance[0, 0]) if scalar else covariance.copy())
-    return gaussian

@@ -27,7 +27,7 @@ class PlanRun:
         value: expected reward at the end; -inf where nothing finite was met.
         outcome: "converged", "iteration limit", "oscillation", "stalled" (no step gains any more), "not finite",
             "worker died" or "interrupted".
-        iterations: gradient evaluations.
+        gradients: gradient evaluations.
         history: the values on the way.
     """
 
@@ -36,7 +36,7 @@ class PlanRun:
     actions: dict[str, Any]
     value: float
     outcome: str
-    iterations: int
+    gradients: int
     history: tuple[float, ...]
 
 
@@ -72,7 +72,7 @@ class Plan:
     def __str__(self) -> str:
         lines = [f"{label} = {choice}" for label, choice in self.selections.items()]
         lines += [f"{label} = {self._quantity(label, value)}" for label, value in self.actions.items()]
-        gradients = sum(run.iterations for run in self.runs)
+        gradients = sum(run.gradients for run in self.runs)
         lines.append(f"value {self.value:.6g}: {self.status}")
         lines.append(f"  {gradients} gradients in {1e3 * self.seconds:.1f} ms by {self.optimizer}, seed {self.seed}")
         lines += [f"  note: {note}" for note in self.notes]
@@ -115,7 +115,7 @@ class Plan:
                     "actions": _plain(run.actions),
                     "value": run.value,
                     "outcome": run.outcome,
-                    "iterations": run.iterations,
+                    "gradients": run.gradients,
                     "history": list(run.history),
                 }
                 for run in self.runs

@@ -11,7 +11,7 @@ import numpy as np
 from symgraph.errors import InputError, SolveError, did_you_mean, names
 from symgraph.objective import Objective, Situation, check_choice, checked_column, stacked_index
 from symgraph.optimizers.lbfgs import Lbfgs
-from symgraph.optimizers.problem import Evaluator, Optimizer, Problem, Run, Search, best_of
+from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
 from symgraph.plan import Plan, PlanRun
 from symgraph.progress import Progress
 from symgraph.slots import Action, Selection
@@ -56,25 +56,26 @@ def solve(
     begin = time.perf_counter()
     situation = objective.situation(state)
     with Progress("planning", progress) as bar:
+        if not situation.build.has_kernel:
+            bar.wait("compiling")
         problem = _problem(objective, situation, guess, fixed or {}, bar)
         search = optimizer.run(problem, np.random.default_rng(seed))
     best = best_of(search.runs)
     if best is None:
         if search.interrupted:
             raise KeyboardInterrupt
-        raise SolveError(_why_not_finite(objective, situation, problem, search))
-    actions = objective.unstack(problem.evaluate.complete(best.point[None])[0])
+        raise SolveError(_why_not_finite(objective, situation, search))
     selections = _selections(objective, best)
-    columns = [objective.stack_actions(actions), objective.one_hot(selections), *problem.evaluate.shared]
+    columns = [best.point, objective.one_hot(selections), *situation.shared]
     nodes = situation.build.outcomes(columns, selections, situation.given)
     return Plan(
-        actions=actions,
+        actions=objective.unstack(best.point),
         selections=selections,
         value=best.value,
         status=f"interrupted: best of {len(search.runs)} runs" if search.interrupted else search.status,
         notes=tuple(nodes.notes()),
         nodes=nodes,
-        runs=_Runs(objective, problem.evaluate, search.runs),
+        runs=_Runs(objective, search.runs),
         optimizer=type(optimizer).__name__,
         seed=int(seed),
         seconds=time.perf_counter() - begin,
@@ -89,37 +90,25 @@ def _problem(
     fixed: Mapping[str, Any],
     progress: Progress,
 ) -> Problem:
-    actions, selections = objective.graph.actions(), objective.graph.selections()
-    low, high = objective.bounds
-    where = stacked_index(actions)
-    template = low.copy()
-    held = low == high  # an action without room is held, so that no range is zero
+    low, high = (bound.copy() for bound in objective.bounds)
+    selections = objective.graph.selections()
+    where = stacked_index(objective.graph.actions())
     allowed = {label: tuple(range(slot.size)) for label, slot in selections.items()}
     for label, value in fixed.items():
         slot = _planned_slot(objective, label, "fixed")
         if isinstance(slot, Action):
-            template[where[label]] = checked_column(value, slot.size, f"fixed action {label!r}")
-            held[where[label]] = True
+            low[where[label]] = high[where[label]] = checked_column(value, slot.size, f"fixed action {label!r}")
         else:
             check_choice(label, value, slot)
             allowed[label] = (slot.choices.index(value),)
-    free = np.flatnonzero(~held)
-    progress.wait("compiling")
-    evaluate = Evaluator(
-        kernel=situation.build.kernel,
-        shared=tuple(situation.shared),
-        template=template,
-        free=free,
-        sizes=tuple(slot.size for slot in selections.values()),
-    )
-    progress.wait("planning")
     return Problem(
-        evaluate=evaluate,
+        kernel=situation.build.kernel.bind(situation.shared),
         situation=situation,
-        low=low[free],
-        high=high[free],
+        low=low,
+        high=high,
+        sizes=tuple(slot.size for slot in selections.values()),
         allowed=tuple(allowed.values()),
-        guesses=tuple(_guess(objective, one, free, allowed) for one in _listed(guess)),
+        guesses=tuple(_guess(objective, one, allowed) for one in _listed(guess)),
         progress=progress,
     )
 
@@ -134,8 +123,8 @@ def _listed(guess: Guess | Sequence[Guess] | None) -> list[Guess]:
     raise InputError(f"guess is {guess!r}; give a plan, {{label: value}}, or a list of them")
 
 
-def _guess(objective: Objective, guess: Guess, free: Any, allowed: Mapping[str, tuple[int, ...]]) -> tuple[Any, Any]:
-    """Turn a guess into free actions (n,), NaN where left out, and choices (s,), -1 where left out or ruled out."""
+def _guess(objective: Objective, guess: Guess, allowed: Mapping[str, tuple[int, ...]]) -> tuple[Any, Any]:
+    """Turn a guess into actions (n,), NaN where left out, and choices (s,), -1 where left out or ruled out."""
     values = {**guess.actions, **guess.selections} if isinstance(guess, Plan) else guess
     where = stacked_index(objective.graph.actions())
     point = np.full(objective.n_actions, np.nan)
@@ -148,7 +137,7 @@ def _guess(objective: Objective, guess: Guess, free: Any, allowed: Mapping[str, 
             check_choice(label, value, slot)
             choice = slot.choices.index(value)
             choices[label] = choice if choice in allowed[label] else -1
-    return point[free], np.array(list(choices.values()), dtype=np.int64)
+    return point, np.array(list(choices.values()), dtype=np.int64)
 
 
 def _planned_slot(objective: Objective, label: str, place: str) -> Action | Selection:
@@ -168,16 +157,15 @@ def _selections(objective: Objective, run: Run) -> dict[str, str]:
     return {label: slot.choices[int(c)] for (label, slot), c in zip(slots, run.choices, strict=True)}
 
 
-def _why_not_finite(objective: Objective, situation: Situation, problem: Problem, search: Search) -> str:
+def _why_not_finite(objective: Objective, situation: Situation, search: Search) -> str:
     """Say where the first start point stopped being finite."""
     died = sum(run.outcome == "worker died" for run in search.runs)
     if not search.runs or died == len(search.runs):
         return f"no start point was finished: {search.status}; {died} runs were lost with their worker processes"
     run = search.runs[0]
-    actions = objective.unstack(problem.evaluate.complete(run.start[None])[0])
     selections = _selections(objective, run)
-    columns = [objective.stack_actions(actions), objective.one_hot(selections), *problem.evaluate.shared]
-    at = f"at actions {actions}, selections {selections}"
+    columns = [run.start, objective.one_hot(selections), *situation.shared]
+    at = f"at actions {objective.unstack(run.start)}, selections {selections}"
     for node in situation.build.outcomes(columns, selections, situation.given):
         if not node.probability:
             continue
@@ -192,9 +180,8 @@ def _why_not_finite(objective: Objective, situation: Situation, problem: Problem
 class _Runs(Sequence[PlanRun]):
     """The runs by labels; each row is made when it is looked at."""
 
-    def __init__(self, objective: Objective, evaluate: Evaluator, runs: list[Run]) -> None:
+    def __init__(self, objective: Objective, runs: list[Run]) -> None:
         self._objective = objective
-        self._evaluate = evaluate
         self._runs = runs
 
     def __len__(self) -> int:
@@ -208,15 +195,14 @@ class _Runs(Sequence[PlanRun]):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         run = self._runs[index]
-        start, end = self._evaluate.complete(np.array([run.start, run.point]))
         return PlanRun(
             selections=_selections(self._objective, run),
-            start=self._objective.unstack(start),
-            actions=self._objective.unstack(end),
+            start=self._objective.unstack(run.start),
+            actions=self._objective.unstack(run.point),
             value=run.value,
             outcome=run.outcome,
-            iterations=run.iterations,
-            history=tuple(run.history),
+            gradients=len(run.history),
+            history=tuple(run.history.tolist()),
         )
 
     def __iter__(self) -> Iterator[PlanRun]:

@@ -213,6 +213,15 @@ def _numeric(mean: Any, covariance: Any, sd: Any) -> tuple[Any, Any]:
     return (float(column[0]), float(matrix[0, 0])) if n == 1 else (column, matrix)
 
 
+def unchecked_gaussian(mean: Array, covariance: Array) -> Gaussian:
+    """Make a Gaussian of computed numbers, which may be NaN or indefinite by rounding."""
+    gaussian = Gaussian.__new__(Gaussian)
+    scalar = mean.size == 1
+    object.__setattr__(gaussian, "mean", float(mean[0]) if scalar else mean.copy())
+    object.__setattr__(gaussian, "covariance", float(covariance[0, 0]) if scalar else covariance.copy())
+    return gaussian
+
+
 def as_column(value: Any, place: str) -> Array:
     """Turn a number or a sequence into a finite (n,) array; raise SlotError naming the place otherwise."""
     try:

@@ -38,7 +38,7 @@ def find_compiler() -> str | None:
     return None
 
 
-def load(source: str, compiler: str) -> tuple[ctypes.CDLL, Path]:
+def load(source: str, compiler: str) -> ctypes.CDLL:
     """Compile C source, or find it compiled, and load it.
 
     Raises:
@@ -49,11 +49,11 @@ def load(source: str, compiler: str) -> tuple[ctypes.CDLL, Path]:
     path = folder / f"{key}.so"
     if path.exists():
         try:
-            return ctypes.CDLL(str(path)), path
+            return ctypes.CDLL(str(path))
         except OSError:  # cut short by a full disk or a crash: make it anew
             path.unlink(missing_ok=True)
     _compile(source, compiler, path)
-    return ctypes.CDLL(str(path)), path
+    return ctypes.CDLL(str(path))
 
 
 def _compile(source: str, compiler: str, path: Path) -> None:

@@ -3,6 +3,6 @@
 from symgraph.optimizers.adadelta import Adadelta
 from symgraph.optimizers.ipopt import Ipopt
 from symgraph.optimizers.lbfgs import Lbfgs
-from symgraph.optimizers.problem import Evaluator, Optimizer, Problem, Run, Search
+from symgraph.optimizers.problem import Optimizer, Problem, Run, Search
 
-__all__ = ["Adadelta", "Evaluator", "Ipopt", "Lbfgs", "Optimizer", "Problem", "Run", "Search"]
+__all__ = ["Adadelta", "Ipopt", "Lbfgs", "Optimizer", "Problem", "Run", "Search"]

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from symgraph.compile.kernel import AdadeltaSteps, BoundKernel, Ended
 from symgraph.errors import InputError
-from symgraph.optimizers.climb import climb
-from symgraph.optimizers.lbfgs import positive_whole
-from symgraph.optimizers.problem import Choices, Evaluator, Optimizer, Outcome, Problem, Run, Search, best_of
+from symgraph.optimizers.lbfgs import climbed, positive_whole
+from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
 from symgraph.slots import Array
 
-LANES = 16  # points that one process moves side by side; they take the place of the paper's processes
+RUNS_PER_TASK = 4  # runs that a worker process is handed at once
+MAX_DEATHS = 2  # workers that may die before the search ends with what it has
 POLISHED = 2  # best runs of each combination of selections that are polished
 POLISH_ITERATIONS = 200
 
@@ -26,14 +27,14 @@ class Adadelta(Optimizer):
 
     A point is taken from the queue, moved for at most `run_iterations` steps and ends a run (1) converged:
     0 ≤ J_new − J < tolerance, (2) at the iteration limit, or (3) oscillating: `oscillation` steps lowered J.
-    Case (1) joins the finished list, (2) and (3) only when better than all so far; every point goes back to the queue.
-    The search ends when (a) `finished` points are finished, (b) the queue is empty, or (c) `total_iterations` are spent.
-    From the queue comes the best point (probability 0.4), a random one (0.3), or else the worst is dropped for a
-    perturbed copy of the best finished point.
+    Case (1) joins the finished list, (2) and (3) only when better than all so far; with `requeue`, every point then goes
+    back to the queue. The search ends when (a) `finished` points are finished, (b) the queue is empty, or
+    (c) `total_iterations` are spent. From a queue that points come back to, the next is the best point (probability
+    0.4), a random one (0.3), or else the worst is dropped for a perturbed copy of the best finished point.
 
     The defaults go beyond the paper where measurement showed gain: steps in units of the bounds' range, starts spread
-    evenly over selections and bounds, the best iterate instead of the last, a polish by L-BFGS before selections are
-    compared. `Adadelta.paper()` has the paper's settings.
+    evenly over selections and bounds, one longer run for each, the best iterate instead of the last, a polish by L-BFGS
+    before selections are compared. `Adadelta.paper()` has the paper's settings.
 
     Args:
         starts: start points.
@@ -45,8 +46,8 @@ class Adadelta(Optimizer):
         tolerance: gain below which a step counts as converged [reward].
         oscillation: falling steps that end a run.
         sampling: "spread" (Latin hypercube), "uniform" or "gaussian" (around the middle, a quarter of the range).
-        evenly: spread the starts evenly over the combinations of selections and let each have its turn before any
-            comes back; else selections and turns are random as in the paper.
+        evenly: spread the starts evenly over the combinations of selections; else uniformly at random.
+        requeue: points go back to the queue after a run; else each start has one run.
         scaled: steps in units of the bounds' range.
         keep_best: a run's result is its best iterate; else its last.
         polish: climb on from the best runs of each combination with L-BFGS.
@@ -66,6 +67,7 @@ class Adadelta(Optimizer):
     oscillation: int = 10
     sampling: str = "spread"
     evenly: bool = True
+    requeue: bool = False
     scaled: bool = True
     keep_best: bool = True
     polish: bool = True
@@ -86,6 +88,7 @@ class Adadelta(Optimizer):
             oscillation=10,
             sampling="uniform",
             evenly=False,
+            requeue=True,
             scaled=False,
             keep_best=False,
             polish=False,
@@ -112,53 +115,58 @@ class Adadelta(Optimizer):
         queue = _Queue(self, problem, rng)
         total = self.total_iterations or len(queue.waiting) * self.run_iterations
         wanted = self.finished or len(queue.waiting)
-        spent = 0
+        spent, deaths = 0, 0
         ended: list[Run] = []
         finished: list[Run] = []
-        interrupted, deaths = False, 0
+        interrupted = False
         try:
-            with _workers(self.processes) as move:
-                while len(finished) < wanted and queue.waiting and spent < total:
-                    batch = queue.pop(LANES * self.processes, wanted - len(finished), finished)
+            with _movers(self.processes) as move:
+                while len(finished) < wanted and queue.waiting and spent < total and deaths <= MAX_DEATHS:
+                    # One point at a time, or a few per process, since handing them over has its price.
+                    most = 1 if self.processes == 1 else RUNS_PER_TASK * self.processes
+                    batch = queue.pop(min(most, wanted - len(finished)), finished)
                     limit = min(self.run_iterations, max(1, (total - spent) // len(batch)))
-                    runs, died = move(self, problem, batch, limit)
-                    deaths += died
+                    runs = move(self, problem, batch, limit)
+                    deaths += any(run.outcome == "worker died" for run in runs)
                     for run in runs:
-                        spent += run.iterations
+                        spent += len(run.history) - 1
                         best = best_of(finished)
                         if run.outcome == "converged" or (
                             run.outcome in ("iteration limit", "oscillation") and (best is None or run.value > best.value)
                         ):
                             finished.append(run)
-                        if run.outcome in ("converged", "iteration limit", "oscillation"):
+                        if self.requeue and run.outcome in ("converged", "iteration limit", "oscillation"):
                             queue.waiting.append(run)
                     ended += runs
                     problem.progress.update(max(spent / total, len(finished) / wanted), 1.0)
-                    if deaths > MAX_DEATHS:
-                        break
         except KeyboardInterrupt:
             interrupted = True
         if self.polish and not interrupted:
-            ended += self._polished(problem, ended)
-            interrupted = any(run.outcome == "interrupted" for run in ended)
-        status = f"best of {len(ended)} runs from {queue.starts} starts"
-        return Search(ended, status, interrupted)
+            polished, interrupted = self._polished(problem, ended)
+            ended += polished
+        return Search(ended, f"best of {queue.starts} starts", interrupted)
 
-    def _polished(self, problem: Problem, runs: list[Run]) -> list[Run]:
-        """Climb on from the best runs of each combination of selections."""
+    @property
+    def _steps(self) -> AdadeltaSteps:
+        return AdadeltaSteps(
+            self.decay, self.epsilon, self.tolerance, self.oscillation, self.scaled, self.keep_best
+        )
+
+    @staticmethod
+    def _polished(problem: Problem, runs: list[Run]) -> tuple[list[Run], bool]:
+        """Climb on from the best runs of each combination of selections; also say whether that was interrupted."""
         by_choice: dict[bytes, list[Run]] = {}
         for run in sorted(runs, key=lambda run: -run.value):
             group = by_choice.setdefault(run.choices.tobytes(), [])
             if np.isfinite(run.value) and len(group) < POLISHED:
                 group.append(run)
         chosen = [run for group in by_choice.values() for run in group]
-        if not chosen:
-            return []
-        points, choices = np.array([run.point for run in chosen]), np.array([run.choices for run in chosen])
-        polished = climb(problem, points, choices, POLISH_ITERATIONS, 1e-9)
-        for before, after in zip(chosen, polished, strict=True):
+        points = np.array([run.point for run in chosen]).reshape(len(chosen), problem.n)
+        choices = np.array([run.choices for run in chosen]).reshape(len(chosen), len(problem.sizes))
+        polished = climbed(problem, points, choices, POLISH_ITERATIONS, 1e-9)
+        for before, after in zip(chosen, polished, strict=False):
             after.start = before.start
-        return polished
+        return polished, len(polished) < len(chosen)
 
 
 class _Queue:
@@ -174,23 +182,22 @@ class _Queue:
             guessed, guessed_choices = problem.started_from_guesses(rng)
             points, choices = np.concatenate([guessed, points]), np.concatenate([guessed_choices, choices])
         self.starts = len(points)
-        values, _ = problem.evaluate(points, choices)
-        self._turns = len(points) if settings.evenly else 0  # starts at the head of the queue that have their turn first
+        values = problem.values(points, choices)
+        self._in_turn = not settings.requeue
         self.waiting = [
-            Run(point, point, choice, float(value), "iteration limit", 0)
+            Run(point, point, choice, float(value), "iteration limit", np.zeros(0))
             for point, choice, value in zip(points, choices, values, strict=True)
         ]
 
-    def pop(self, most: int, wanted: int, finished: list[Run]) -> list[Run]:
-        """Take up to `most` points, no more than are still wanted."""
+    def pop(self, most: int, finished: list[Run]) -> list[Run]:
+        """Take up to `most` points."""
         batch: list[Run] = []
-        while self.waiting and len(batch) < min(most, wanted):
+        while self.waiting and len(batch) < most:
             batch.append(self._pop_one(finished))
         return batch
 
     def _pop_one(self, finished: list[Run]) -> Run:
-        if self._turns:
-            self._turns -= 1
+        if self._in_turn:
             return self.waiting.pop(0)
         draw = self._rng.random()
         if draw < 0.4:
@@ -202,101 +209,41 @@ class _Queue:
         low, high = self._problem.low, self._problem.high
         noise = 0.001 * (high - low) * self._rng.standard_normal(self._problem.n)
         point = np.clip(best.point + noise, low, high)
-        return Run(point, point, best.choices, -np.inf, "iteration limit", 0)
+        return Run(point, point, best.choices, -np.inf, "iteration limit", np.zeros(0))
 
 
-def ascend(settings: Adadelta, evaluate: Evaluator, box: tuple[Array, Array], points: Array, choices: Choices, limit: int) -> list[Run]:
-    """Move points (P, n) by ADADELTA for at most `limit` steps each.
-
-    ADADELTA on gradient g:  v ← ρv + (1 − ρ)g²,  Δ = g √(w + ε)/√(v + ε),  w ← ρw + (1 − ρ)Δ²,  x ← clip(x + Δ).
-
-    Source: Zeiler, arXiv:1212.5701, algorithm 1, with the sign of ascent.
-    """
-    low, high = box
-    span = high - low if settings.scaled else np.ones_like(low)
-    rho, epsilon = settings.decay, settings.epsilon
-    x = points.copy()
-    value, gradient = evaluate(x, choices)
-    best_x, best_value = x.copy(), value.copy()
-    v, w = np.zeros_like(x), np.zeros_like(x)
-    falls = np.zeros(len(x), dtype=np.int64)
-    spent = np.zeros(len(x), dtype=np.int64)
-    outcome: list[Outcome] = ["iteration limit"] * len(x)
-    history = [[float(j)] for j in value]
-    active = np.isfinite(value)
-    for p in np.flatnonzero(~active):
-        outcome[p] = "not finite"
-    for _ in range(limit):
-        rows = np.flatnonzero(active)
-        if not rows.size:
-            break
-        g = gradient[rows] * span
-        v[rows] = rho * v[rows] + (1.0 - rho) * g * g
-        step = g * np.sqrt((w[rows] + epsilon) / (v[rows] + epsilon))
-        w[rows] = rho * w[rows] + (1.0 - rho) * step * step
-        x[rows] = np.clip(x[rows] + step * span, low, high)
-        new, gradient[rows] = evaluate(x[rows], choices[rows])
-        gain = new - value[rows]
-        value[rows] = new
-        spent[rows] += 1
-        falls[rows] += gain < 0.0
-        better = new > best_value[rows]
-        best_x[rows[better]], best_value[rows[better]] = x[rows[better]], new[better]
-        for row, j in zip(rows, new, strict=True):
-            history[row].append(float(j))
-        ends: tuple[tuple[Any, Outcome], ...] = (
-            (falls[rows] >= settings.oscillation, "oscillation"),
-            ((gain >= 0.0) & (gain < settings.tolerance), "converged"),
-            (~np.isfinite(new), "not finite"),
-        )
-        for reached, name in ends:
-            for row in rows[reached]:
-                outcome[row], active[row] = name, False
-    if settings.keep_best:
-        x, value = best_x, best_value
-    return [Run(points[p], x[p], choices[p], float(value[p]), outcome[p], int(spent[p]), history[p]) for p in range(len(x))]
-
-
-MAX_DEATHS = 2  # workers that may die before the search ends with what it has
+def _move(kernel: BoundKernel, box: tuple[Array, Array], points: Array, hot: Array, limit: int, steps: AdadeltaSteps) -> list[Ended]:
+    """Move points (P, n) one after the other; at the top level so that worker processes find it."""
+    return [kernel.ascend(point, one_hot, *box, limit, steps) for point, one_hot in zip(points, hot, strict=True)]
 
 
 @contextmanager
-def _workers(processes: int) -> Iterator[Any]:
+def _movers(processes: int) -> Iterator[Callable[[Adadelta, Problem, list[Run], int], list[Run]]]:
     """Yield the function that moves a batch of runs, in this process or in several."""
     if processes == 1:
-        yield _move_here
+        yield lambda settings, problem, batch, limit: _joined(batch, _move(*_task(settings, problem, batch, limit)))
         return
     from joblib import Parallel, delayed
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
     with Parallel(n_jobs=processes, max_nbytes=None) as parallel:
 
-        def move(settings: Adadelta, problem: Problem, batch: list[Run], limit: int) -> tuple[list[Run], int]:
+        def move(settings: Adadelta, problem: Problem, batch: list[Run], limit: int) -> list[Run]:
             blocks = [batch[i::processes] for i in range(processes) if batch[i::processes]]
-            tasks = [delayed(ascend)(*_ascend_arguments(settings, problem, block, limit)) for block in blocks]
             try:
-                runs = [run for block in parallel(tasks) for run in block]
+                results = parallel([delayed(_move)(*_task(settings, problem, block, limit)) for block in blocks])
             except TerminatedWorkerError:
-                for run in batch:
-                    run.outcome = "worker died"
-                return batch, 1
-            order = [run for block in blocks for run in block]
-            return _with_starts(order, runs), 0
+                return [Run(r.start, r.point, r.choices, r.value, "worker died", r.history) for r in batch]
+            return [run for block, ended in zip(blocks, results, strict=True) for run in _joined(block, ended)]
 
         yield move
 
 
-def _move_here(settings: Adadelta, problem: Problem, batch: list[Run], limit: int) -> tuple[list[Run], int]:
-    return _with_starts(batch, ascend(*_ascend_arguments(settings, problem, batch, limit))), 0
-
-
-def _ascend_arguments(settings: Adadelta, problem: Problem, batch: list[Run], limit: int) -> tuple[Any, ...]:
+def _task(settings: Adadelta, problem: Problem, batch: list[Run], limit: int) -> tuple[Any, ...]:
     points, choices = np.array([run.point for run in batch]), np.array([run.choices for run in batch])
-    return settings, problem.evaluate, (problem.low, problem.high), points, choices, limit
+    return problem.kernel, (problem.low, problem.high), points, problem.one_hot(choices), limit, settings._steps
 
 
-def _with_starts(before: list[Run], after: list[Run]) -> list[Run]:
+def _joined(batch: list[Run], ended: list[Ended]) -> list[Run]:
     """A point that came back from the queue keeps where it first started."""
-    for old, new in zip(before, after, strict=True):
-        new.start = old.start
-    return after
+    return [Run.of(before.start, before.choices, after) for before, after in zip(batch, ended, strict=True)]

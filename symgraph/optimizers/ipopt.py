@@ -4,11 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 
+from symgraph.compile.kernel import Outcome
 from symgraph.optimizers.lbfgs import positive_whole, promising_points
-from symgraph.optimizers.problem import Optimizer, Outcome, Problem, Run, Search
+from symgraph.optimizers.problem import Choices, Optimizer, Problem, Run, Search
+from symgraph.slots import Array
+
+
+_OUTCOMES: dict[str, Outcome] = {
+    "Solve_Succeeded": "converged",
+    "Solved_To_Acceptable_Level": "converged",
+    "Maximum_Iterations_Exceeded": "iteration limit",
+    "Invalid_Number_Detected": "not finite",
+}
 
 
 @dataclass(frozen=True)
@@ -38,10 +47,10 @@ class Ipopt(Optimizer):
         if problem.guesses:
             points, choices = problem.started_from_guesses(rng)
         else:
-            samples = max(1, self.samples // problem.combinations)
-            points, choices = promising_points(problem, rng, self.samples, samples)
-            values, _ = problem.evaluate(points, choices)
-            best = int(np.argmax(values))
+            # One candidate for each combination of selections.
+            groups = min(self.samples, problem.combinations)
+            points, choices = promising_points(problem, rng, groups, max(1, self.samples // groups))
+            best = int(np.argmax(problem.values(points, choices)))
             points, choices = points[best : best + 1], choices[best : best + 1]
         runs: list[Run] = []
         try:
@@ -52,32 +61,23 @@ class Ipopt(Optimizer):
         status = runs[0].outcome if len(runs) == 1 else f"best of {len(runs)} starts"
         return Search(runs, status)
 
-    def _from(self, problem: Problem, point: np.ndarray, choice: np.ndarray) -> Run:
-        evaluate = problem.evaluate
-        start_value, _ = evaluate(point[None], choice[None])
-        if problem.n == 0 or not np.isfinite(start_value[0]):
-            outcome: Outcome = "converged" if np.isfinite(start_value[0]) else "not finite"
-            return Run(point, point, choice, float(start_value[0]), outcome, 1, [float(start_value[0])])
+    def _from(self, problem: Problem, point: Array, choice: Choices) -> Run:
+        hot = problem.one_hot(choice[None])
+        start_value = float(problem.values(point[None], choice[None])[0])
+        if not np.isfinite(start_value):
+            return Run(point, point, choice, start_value, "not finite", np.array([start_value]))
+        if problem.n == 0:
+            return Run(point, point, choice, start_value, "converged", np.array([start_value]))
         solver = problem.situation.build.ipopt(self.iterations, self.tolerance)
-        low, high = evaluate.template.copy(), evaluate.template.copy()
-        low[evaluate.free], high[evaluate.free] = problem.low, problem.high
-        start = evaluate.complete(point[None])[0]
-        parameters = np.concatenate([evaluate.one_hot(choice[None])[0], *map(np.ravel, evaluate.shared)])
-        found = solver(x0=start, lbx=low, ubx=high, p=ca.DM(parameters))
+        parameters = np.concatenate([hot[0], *problem.situation.shared])
+        found = solver(x0=point, lbx=problem.low, ubx=problem.high, p=parameters)
         statistics = solver.stats()
-        end = np.clip(np.array(found["x"]).ravel()[evaluate.free], problem.low, problem.high)
-        value, _ = evaluate(end[None], choice[None])
-        history = [-float(f) for f in statistics.get("iterations", {}).get("obj", [])]
-        iterations = int(statistics["iter_count"])
         status = str(statistics["return_status"])
         if status == "User_Requested_Stop":
             raise KeyboardInterrupt
-        if not value[0] >= start_value[0]:  # NaN half-way, or it went astray: the start is the better plan
+        end = np.clip(np.array(found["x"]).ravel(), problem.low, problem.high)
+        value = float(problem.values(end[None], choice[None])[0])
+        if not value >= start_value:  # not finite half-way, or gone astray: the start is the better plan
             end, value = point, start_value
-        outcomes: dict[str, Outcome] = {
-            "Solve_Succeeded": "converged",
-            "Solved_To_Acceptable_Level": "converged",
-            "Maximum_Iterations_Exceeded": "iteration limit",
-            "Invalid_Number_Detected": "not finite",
-        }
-        return Run(point, end, choice, float(value[0]), outcomes.get(status, "stalled"), iterations, history)
+        history = -np.array(statistics.get("iterations", {}).get("obj", [-start_value]))
+        return Run(point, end, choice, value, _OUTCOMES.get(status, "stalled"), history)

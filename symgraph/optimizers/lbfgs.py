@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from symgraph.errors import InputError
-from symgraph.optimizers.climb import climb
-from symgraph.optimizers.problem import Choices, Optimizer, Problem, Search
+from symgraph.optimizers.problem import Choices, Optimizer, Problem, Run, Search
 from symgraph.slots import Array
 
 
@@ -43,16 +42,22 @@ class Lbfgs(Optimizer):
         if problem.guesses:
             guessed, guessed_choices = problem.started_from_guesses(rng)
             points, choices = np.concatenate([guessed, points]), np.concatenate([guessed_choices, choices])
-        runs = climb(
-            problem,
-            points,
-            choices,
-            self.iterations,
-            self.tolerance,
-            report=lambda passes: problem.progress.update(passes, self.iterations),
-        )
-        stopped = sum(run.outcome == "interrupted" for run in runs)
-        return Search(runs, f"best of {len(runs)} starts", interrupted=stopped > 0)
+        runs = climbed(problem, points, choices, self.iterations, self.tolerance)
+        return Search(runs, f"best of {len(points)} starts", interrupted=len(runs) < len(points))
+
+
+def climbed(problem: Problem, points: Array, choices: Choices, iterations: int, tolerance: float) -> list[Run]:
+    """Climb from points (P, n) under choices (P, s); an interrupt ends it with the runs so far."""
+    hot = problem.one_hot(choices)
+    runs: list[Run] = []
+    try:
+        for p in range(len(points)):
+            ended = problem.kernel.climb(points[p], hot[p], problem.low, problem.high, iterations, tolerance)
+            runs.append(Run.of(points[p], choices[p], ended))
+            problem.progress.update(p + 1, len(points))
+    except KeyboardInterrupt:
+        pass
+    return runs
 
 
 def promising_points(problem: Problem, rng: np.random.Generator, starts: int, samples: int) -> tuple[Array, Choices]:
@@ -62,11 +67,12 @@ def promising_points(problem: Problem, rng: np.random.Generator, starts: int, sa
     count = max(2, each * samples) if problem.n else 1
     points = np.concatenate([problem.draw_points(rng, count, "spread") for _ in groups])
     choices = np.repeat(groups, count, axis=0)
-    values, _ = problem.evaluate(points, choices)
+    values = problem.values(points, choices)
+    unit = problem.unit(points)
     kept = []
     for k in range(len(groups)):
         block = np.arange(k * count, (k + 1) * count)
-        kept += [block[i] for i in _peaks((points[block] - problem.low) / (problem.high - problem.low), values[block], each)]
+        kept += [block[i] for i in _peaks(unit[block], values[block], each)]
     return points[kept], choices[kept]
 
 

@@ -6,90 +6,37 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from symgraph.compile.kernel import Kernel
+from symgraph.compile.kernel import BoundKernel, Ended, Outcome
 from symgraph.objective import Situation
 from symgraph.progress import Progress
 from symgraph.slots import Array
 
 Choices = npt.NDArray[np.int64]  # (P, number of selections): which choice of each selection, a row per point
-Outcome = Literal["converged", "iteration limit", "oscillation", "stalled", "not finite", "worker died", "interrupted"]
-
-
-@dataclass(frozen=True)
-class Evaluator:
-    """Values and gradients over the free actions; small enough to be sent to other processes.
-
-    Attributes:
-        kernel: the objective's value and gradient.
-        shared: the kernel's inputs after actions and selections.
-        template: (n_all,) all actions, the held ones at their value.
-        free: indices into it of the actions that are not held.
-        sizes: number of choices of each selection.
-    """
-
-    kernel: Kernel
-    shared: tuple[Array, ...]
-    template: Array
-    free: npt.NDArray[np.int64]
-    sizes: tuple[int, ...]
-
-    def __call__(self, points: Array, choices: Choices) -> tuple[Array, Array]:
-        """Evaluate points (P, n) under choices (P, s).
-
-        Returns:
-            values (P,), -inf where value or gradient are not finite, and gradients (P, n), 0 there.
-        """
-        actions = self.complete(points)
-        values, gradients = self.kernel(actions, self.one_hot(choices), self.shared)
-        if self.free.size < self.template.size:
-            gradients = gradients[:, self.free]
-        bad = ~(np.isfinite(values) & np.isfinite(gradients).all(axis=1))
-        if bad.any():
-            values[bad] = -np.inf
-            gradients[bad] = 0.0
-        return values, gradients
-
-    def complete(self, points: Array) -> Array:
-        """Return (P, n_all) actions, the held ones included."""
-        if self.free.size == self.template.size:
-            return points
-        actions = np.tile(self.template, (len(points), 1))
-        actions[:, self.free] = points
-        return actions
-
-    def one_hot(self, choices: Choices) -> Array:
-        """Return (P, Σ sizes) one-hot rows."""
-        hot = np.zeros((len(choices), sum(self.sizes)))
-        rows = np.arange(len(choices))
-        offset = 0
-        for s, size in enumerate(self.sizes):
-            hot[rows, offset + choices[:, s]] = 1.0
-            offset += size
-        return hot
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Maximise the evaluator's value over a box of free actions and the allowed choices.
+    """Maximise the kernel's value over a box of actions and the allowed choices.
 
     Attributes:
-        evaluate: values and gradients.
-        situation: the checked start state, with the symbolic expression behind it.
-        low, high: (n,) bounds of the free actions.
+        kernel: values, gradients and local search, bound to the start state.
+        situation: that state, with the symbolic expression behind it.
+        low, high: (n,) bounds of the stacked actions; a held action has low = high.
+        sizes: number of choices of each selection.
         allowed: for each selection, the choices that are not ruled out.
         guesses: start points from the user, each (n,) actions (NaN: not given) and (s,) choices (-1: not given).
         progress: to report to.
     """
 
-    evaluate: Evaluator
+    kernel: BoundKernel
     situation: Situation
     low: Array
     high: Array
+    sizes: tuple[int, ...]
     allowed: tuple[tuple[int, ...], ...]
     guesses: tuple[tuple[Array, Choices], ...] = ()
     progress: Progress = field(default_factory=lambda: Progress("planning", shown=False))
@@ -102,6 +49,26 @@ class Problem:
     def combinations(self) -> int:
         """Number of combinations of allowed choices."""
         return math.prod(len(choices) for choices in self.allowed)
+
+    def values(self, points: Array, choices: Choices) -> Array:
+        """Return the values (P,) of points (P, n) under choices (P, s), -inf where they are not finite."""
+        values, _ = self.kernel.evaluate(points, self.one_hot(choices))
+        return np.where(np.isfinite(values), values, -np.inf)
+
+    def one_hot(self, choices: Choices) -> Array:
+        """Return (P, Σ sizes) one-hot rows."""
+        hot = np.zeros((len(choices), sum(self.sizes)))
+        rows = np.arange(len(choices))
+        offset = 0
+        for s, size in enumerate(self.sizes):
+            hot[rows, offset + choices[:, s]] = 1.0
+            offset += size
+        return hot
+
+    def unit(self, points: Array) -> Array:
+        """Scale points to [0, 1] within the bounds; held actions become 0."""
+        span = self.high - self.low
+        return (points - self.low) / np.where(span > 0.0, span, 1.0)
 
     def draw_choices(self, rng: np.random.Generator, count: int, evenly: bool) -> Choices:
         """Draw choices (count, s): evenly over the combinations, or independently and uniformly."""
@@ -154,13 +121,12 @@ class Run:
     """What became of one start point.
 
     Attributes:
-        start: (n,) free actions at the start.
-        point: (n,) free actions at the end.
+        start: (n,) actions at the start.
+        point: (n,) actions at the end.
         choices: (s,) the selections, which a run keeps.
-        value: the expected reward at `point`.
+        value: the expected reward at `point`, -inf where nothing finite was met.
         outcome: why it ended.
-        iterations: gradient evaluations spent on it.
-        history: the values on the way.
+        history: the values on the way, one per gradient.
     """
 
     start: Array
@@ -168,8 +134,11 @@ class Run:
     choices: Choices
     value: float
     outcome: Outcome
-    iterations: int
-    history: list[float] = field(default_factory=list)
+    history: Array
+
+    @classmethod
+    def of(cls, start: Array, choices: Choices, ended: Ended) -> Run:
+        return cls(start, ended.point, choices, ended.value, ended.outcome, ended.history)
 
 
 @dataclass

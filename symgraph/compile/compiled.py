@@ -1,0 +1,192 @@
+"""Kernels in C: CasADi's code for value and gradient, with the local search compiled around it."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from importlib import resources
+from typing import Any, get_args
+
+import casadi as ca
+import numpy as np
+
+from symgraph.compile.kernel import AdadeltaSteps, BoundKernel, Ended, Kernel, Outcome
+from symgraph.compile.library import load
+from symgraph.slots import Array
+
+# The point-by-point call of CasADi's function, before search.c.
+_HEAD = """
+#define N_ACTIONS {n_actions}
+struct inputs {{ const double *selections; const double *const *shared; double *w; }};
+static int evaluate(const double *x, const struct inputs *in, double *value, double *gradient) {{
+  const double *arg[{arguments}];
+  double *res[{results}];
+  casadi_int iw[{integers}];
+  int i;
+  arg[0] = x;
+  arg[1] = in->selections;
+  for (i = 0; i < {n_shared}; ++i) arg[2 + i] = in->shared[i];
+  res[0] = value;
+  res[1] = gradient;
+  return {name}(arg, res, iw, in->w, 0);
+}}
+"""
+
+# What Python calls, after search.c. Workspace: first CasADi's, then the search's.
+_TAIL = """
+void symgraph_evaluate(long long points, const double *actions, const double *selections, const double *const *shared,
+                       double *values, double *gradients, double *w) {{
+  struct inputs in;
+  long long p;
+  in.shared = shared;
+  in.w = w;
+  for (p = 0; p < points; ++p) {{
+    in.selections = selections + p * {n_selections};
+    if (evaluate(actions + p * N_ACTIONS, &in, values + p, gradients + p * N_ACTIONS)) values[p] = NAN;
+  }}
+}}
+long long symgraph_climb(double *x, const double *selection, const double *const *shared, const double *low,
+                         const double *high, long long iterations, double tolerance, double *value, int *outcome,
+                         double *history, double *w) {{
+  struct inputs in;
+  in.selections = selection;
+  in.shared = shared;
+  in.w = w;
+  return climb(x, &in, low, high, iterations, tolerance, value, outcome, history, w + {work});
+}}
+long long symgraph_ascend(double *x, const double *selection, const double *const *shared, const double *low,
+                          const double *high, long long limit, double decay, double epsilon, double tolerance,
+                          int oscillation, int scaled, int keep_best, double *value, int *outcome, double *history,
+                          double *w) {{
+  struct inputs in;
+  in.selections = selection;
+  in.shared = shared;
+  in.w = w;
+  return ascend(x, &in, low, high, limit, decay, epsilon, tolerance, oscillation, scaled, keep_best, value, outcome,
+                history, w + {work});
+}}
+int symgraph_work(void) {{ return {work} + SEARCH_WORK; }}
+"""
+
+_OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)  # in the order of search.c's enum
+
+
+class CompiledKernel(Kernel):
+    """A kernel as machine code.
+
+    Raises:
+        CompileError: the compiler refused the code.
+    """
+
+    def __init__(self, function: ca.Function, compiler: str) -> None:
+        generator = ca.CodeGenerator("kernel", {"with_header": False})
+        generator.add(function)
+        sizes = {
+            "name": function.name(),
+            "arguments": function.sz_arg(),
+            "results": function.sz_res(),
+            "integers": max(1, function.sz_iw()),
+            "n_actions": function.numel_in(0),
+            "n_selections": function.numel_in(1),
+            "n_shared": function.n_in() - 2,
+            "work": function.sz_w(),
+        }
+        search = (resources.files("symgraph.compile") / "search.c").read_text()
+        self._source = generator.dump() + _HEAD.format(**sizes) + search + _TAIL.format(**sizes)
+        self._compiler = compiler
+        self._load()
+
+    def _load(self) -> None:
+        library = load(self._source, self._compiler)
+        pointer, whole, number = ctypes.c_void_p, ctypes.c_longlong, ctypes.c_double
+        library.symgraph_evaluate.argtypes = [whole, *[pointer] * 6]
+        library.symgraph_evaluate.restype = None
+        library.symgraph_climb.argtypes = [*[pointer] * 5, whole, number, *[pointer] * 4]
+        library.symgraph_climb.restype = whole
+        steps = [whole, number, number, number, ctypes.c_int, ctypes.c_int, ctypes.c_int]
+        library.symgraph_ascend.argtypes = [*[pointer] * 5, *steps, *[pointer] * 4]
+        library.symgraph_ascend.restype = whole
+        self.library: Any = library
+        self.work = int(library.symgraph_work())
+
+    def __getstate__(self) -> dict[str, Any]:  # other processes load the library from the cache
+        return {"_source": self._source, "_compiler": self._compiler}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._load()
+
+    def bind(self, shared: Sequence[Array]) -> BoundKernel:
+        return _BoundCompiled(self, [_contiguous(column) for column in shared])
+
+
+class _BoundCompiled(BoundKernel):
+    def __init__(self, kernel: CompiledKernel, shared: list[Array]) -> None:
+        self._kernel = kernel
+        self._shared = shared
+        pointers = (ctypes.c_void_p * max(1, len(shared)))(*[_address(column) for column in shared])
+        self._pointers = pointers  # kept alive beside their address
+        self._shared_address = ctypes.addressof(pointers)
+        self._work = np.empty(kernel.work)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _BoundCompiled, (self._kernel, self._shared)
+
+    def evaluate(self, actions: Array, selections: Array) -> tuple[Array, Array]:
+        actions, selections = _contiguous(actions), _contiguous(selections)
+        values, gradients = np.empty(len(actions)), np.empty(actions.shape)
+        self._kernel.library.symgraph_evaluate(
+            len(actions),
+            _address(actions),
+            _address(selections),
+            self._shared_address,
+            _address(values),
+            _address(gradients),
+            _address(self._work),
+        )
+        return values, gradients
+
+    def climb(self, start: Array, selection: Array, low: Array, high: Array, iterations: int, tolerance: float) -> Ended:
+        return self._search(
+            self._kernel.library.symgraph_climb, start, selection, low, high, iterations, (iterations, tolerance)
+        )
+
+    def ascend(self, start: Array, selection: Array, low: Array, high: Array, limit: int, steps: AdadeltaSteps) -> Ended:
+        settings = (
+            limit,
+            steps.decay,
+            steps.epsilon,
+            steps.tolerance,
+            steps.oscillation,
+            steps.scaled,
+            steps.keep_best,
+        )
+        return self._search(self._kernel.library.symgraph_ascend, start, selection, low, high, limit + 1, settings)
+
+    def _search(
+        self, function: Any, start: Array, selection: Array, low: Array, high: Array, length: int, settings: tuple[Any, ...]
+    ) -> Ended:
+        point = np.array(start, dtype=float)
+        selection, low, high = _contiguous(selection), _contiguous(low), _contiguous(high)
+        value, outcome, history = ctypes.c_double(), ctypes.c_int(), np.empty(length)
+        spent = function(
+            _address(point),
+            _address(selection),
+            self._shared_address,
+            _address(low),
+            _address(high),
+            *settings,
+            ctypes.addressof(value),
+            ctypes.addressof(outcome),
+            _address(history),
+            _address(self._work),
+        )
+        return Ended(point, value.value, _OUTCOMES[outcome.value], history[:spent].copy())
+
+
+def _contiguous(column: Array) -> Array:
+    return np.ascontiguousarray(column, dtype=float)
+
+
+def _address(column: Array) -> int:
+    return int(column.__array_interface__["data"][0])

@@ -1,0 +1,238 @@
+/* Local search from one point, next to the gradient: projected L-BFGS and ADADELTA.
+
+   C99, libm only, no allocation, no globals. The file that includes this one defines
+     N_ACTIONS                  number of stacked actions
+     struct inputs              what evaluate() needs besides the actions
+     int evaluate(const double *x, const struct inputs *in, double *value, double *gradient)
+                                returns 0, or 1 where the model failed
+   Bounds are low[N_ACTIONS], high[N_ACTIONS]; an action with low == high is held. */
+
+enum outcome { CONVERGED, ITERATION_LIMIT, OSCILLATION, STALLED, NOT_FINITE };
+
+#define PAIRS (N_ACTIONS < 8 ? (N_ACTIONS > 0 ? N_ACTIONS : 1) : 8) /* curvature pairs that L-BFGS keeps */
+#define SEARCH_WORK (2 * PAIRS * (N_ACTIONS + 1) + 8 * N_ACTIONS)     /* doubles of workspace */
+
+static const double FIRST_STEP = 0.05;     /* [range] no curvature is known yet */
+static const double LONGEST_STEP = 0.5;    /* [range] no step crosses more than half of it */
+static const double ARMIJO = 1e-4;         /* sufficient decrease: Nocedal & Wright 2006, equation 3.4 */
+static const double SMALLEST_GAIN = 1e-15; /* relative to the value: less cannot be told from rounding */
+
+static double dot(const double *a, const double *b, const double *mask) {
+  double sum = 0;
+  int i;
+  for (i = 0; i < N_ACTIONS; ++i) sum += mask[i] * a[i] * b[i];
+  return sum;
+}
+
+static double largest(const double *a) {
+  double found = 0;
+  int i;
+  for (i = 0; i < N_ACTIONS; ++i) found = fmax(found, fabs(a[i]));
+  return found;
+}
+
+/* f = -J and its gradient over u = (x - low) / (high - low); returns whether all is finite. */
+static int descend_value(const double *u, const struct inputs *in, const double *low, const double *high, double *x,
+                         double *f, double *g) {
+  double value = 0, check = 0;
+  int i;
+  for (i = 0; i < N_ACTIONS; ++i) x[i] = low[i] + (high[i] - low[i]) * u[i];
+  if (evaluate(x, in, &value, g)) return 0;
+  for (i = 0; i < N_ACTIONS; ++i) {
+    g[i] *= -(high[i] - low[i]);
+    check += g[i];
+  }
+  *f = -value;
+  return isfinite(value) && isfinite(check);
+}
+
+/* Climb from x to a local maximum within the bounds by projected L-BFGS (Liu & Nocedal 1989).
+   history takes up to `iterations` values, one for each gradient; returns their number. */
+static long long climb(double *x, const struct inputs *in, const double *low, const double *high, long long iterations,
+                       double tolerance, double *value, int *outcome, double *history, double *work) {
+  double *s = work, *y = s + PAIRS * N_ACTIONS, *rho = y + PAIRS * N_ACTIONS, *alpha = rho + PAIRS;
+  double *u = alpha + PAIRS, *g = u + N_ACTIONS, *d = g + N_ACTIONS, *trial = d + N_ACTIONS, *g_trial = trial + N_ACTIONS;
+  double *moved = g_trial + N_ACTIONS, *mask = moved + N_ACTIONS, *change = mask + N_ACTIONS;
+  double f = 0, f_trial = 0, t = 1, reach = FIRST_STEP;
+  long long spent = 1;
+  int i, k, stored = 0, newest = -1, fresh = 1, flat = 0, backtracks = 0;
+
+  for (i = 0; i < N_ACTIONS; ++i) u[i] = high[i] > low[i] ? fmin(fmax((x[i] - low[i]) / (high[i] - low[i]), 0), 1) : 0;
+  if (!descend_value(u, in, low, high, x, &f, g)) {
+    *value = history[0] = -INFINITY;
+    *outcome = NOT_FINITE;
+    return 1;
+  }
+  history[0] = -f;
+  *outcome = ITERATION_LIMIT;
+  for (;;) {
+    double predicted = 0, noise = SMALLEST_GAIN * fabs(f), longest;
+    int finite, gained;
+    if (fresh) {
+      double slope = 0, scale = 1, descent;
+      for (i = 0; i < N_ACTIONS; ++i) {
+        int held = high[i] <= low[i] || (u[i] <= 0 && g[i] > 0) || (u[i] >= 1 && g[i] < 0);
+        mask[i] = held ? 0 : 1;
+        slope = fmax(slope, mask[i] * fabs(g[i]));
+        d[i] = -mask[i] * g[i];
+      }
+      if (slope <= tolerance * (1 + fabs(f))) {
+        *outcome = CONVERGED;
+        break;
+      }
+      /* Two-loop recursion within the free actions (Nocedal & Wright 2006, algorithm 7.4), newest pair first. */
+      for (k = 0; k < stored; ++k) {
+        int p = (newest - k + PAIRS) % PAIRS;
+        double sy = dot(s + p * N_ACTIONS, y + p * N_ACTIONS, mask);
+        rho[p] = sy > 0 ? 1 / sy : 0;
+        alpha[p] = rho[p] * dot(s + p * N_ACTIONS, d, mask);
+        for (i = 0; i < N_ACTIONS; ++i) d[i] -= alpha[p] * mask[i] * y[p * N_ACTIONS + i];
+      }
+      for (k = 0; k < stored; ++k) {
+        int p = (newest - k + PAIRS) % PAIRS;
+        if (rho[p] > 0) {
+          scale = 1 / (rho[p] * dot(y + p * N_ACTIONS, y + p * N_ACTIONS, mask));
+          break;
+        }
+      }
+      for (i = 0; i < N_ACTIONS; ++i) d[i] *= scale;
+      for (k = stored - 1; k >= 0; --k) {
+        int p = (newest - k + PAIRS) % PAIRS;
+        double beta = rho[p] * dot(y + p * N_ACTIONS, d, mask);
+        for (i = 0; i < N_ACTIONS; ++i) d[i] += (alpha[p] - beta) * mask[i] * s[p * N_ACTIONS + i];
+      }
+      descent = dot(d, g, mask);
+      if (stored == 0 || !(descent < 0)) { /* nothing known of the curvature: along the gradient */
+        for (i = 0; i < N_ACTIONS; ++i) d[i] = -mask[i] * g[i] * (reach / slope);
+      }
+      longest = largest(d);
+      if (longest > LONGEST_STEP)
+        for (i = 0; i < N_ACTIONS; ++i) d[i] *= LONGEST_STEP / longest;
+      t = 1;
+      backtracks = 0;
+      fresh = 0;
+    }
+    if (spent >= iterations) break;
+    for (i = 0; i < N_ACTIONS; ++i) {
+      trial[i] = fmin(fmax(u[i] + t * d[i], 0), 1);
+      moved[i] = trial[i] - u[i];
+      predicted += g[i] * moved[i];
+    }
+    finite = descend_value(trial, in, low, high, x, &f_trial, g_trial);
+    gained = finite && f_trial <= f + ARMIJO * predicted + noise;
+    if (gained) {
+      double sy = 0, ss = 0, yy = 0;
+      for (i = 0; i < N_ACTIONS; ++i) {
+        change[i] = g_trial[i] - g[i];
+        sy += moved[i] * change[i];
+        ss += moved[i] * moved[i];
+        yy += change[i] * change[i];
+      }
+      if (sy > 1e-12 * sqrt(ss * yy)) {
+        newest = (newest + 1) % PAIRS;
+        if (stored < PAIRS) ++stored;
+        for (i = 0; i < N_ACTIONS; ++i) {
+          s[newest * N_ACTIONS + i] = moved[i];
+          y[newest * N_ACTIONS + i] = change[i];
+        }
+      } else { /* curved the wrong way: what was learnt does not help; on along the gradient with longer steps */
+        stored = 0;
+        reach = fmin(fmax(2 * sqrt(ss), 1e-12), LONGEST_STEP);
+      }
+      flat = f - f_trial <= noise ? flat + 1 : 0;
+      f = f_trial;
+      for (i = 0; i < N_ACTIONS; ++i) {
+        u[i] = trial[i];
+        g[i] = g_trial[i];
+      }
+      fresh = 1;
+    } else {
+      /* The minimum of the parabola through f, its slope and the new value, within a tenth to a half of the step. */
+      double rise = f_trial - f - predicted;
+      double shrink = finite && rise > 0 ? -predicted / (2 * rise) : 0.1;
+      t *= fmin(fmax(shrink, 0.1), 0.5);
+      ++backtracks;
+      if (backtracks > 40 || largest(moved) <= 1e-16) {
+        /* No step gains any more. If the curvature pairs are to blame, the gradient alone will still gain. */
+        if (stored == 0) {
+          *outcome = STALLED;
+          history[spent++] = -f;
+          break;
+        }
+        stored = 0;
+        reach = 1e-3;
+        fresh = 1;
+      }
+    }
+    history[spent++] = -f;
+    if (flat >= 2) {
+      *outcome = CONVERGED;
+      break;
+    }
+  }
+  for (i = 0; i < N_ACTIONS; ++i) x[i] = low[i] + (high[i] - low[i]) * u[i];
+  *value = -f;
+  return spent;
+}
+
+/* Move x by ADADELTA (Zeiler, arXiv:1212.5701, algorithm 1, with the sign of ascent) for at most `limit` steps.
+   history takes up to limit + 1 values, the start's first; returns their number. */
+static long long ascend(double *x, const struct inputs *in, const double *low, const double *high, long long limit,
+                        double rho, double epsilon, double tolerance, int oscillation, int scaled, int keep_best,
+                        double *value, int *outcome, double *history, double *work) {
+  double *g = work, *v = g + N_ACTIONS, *w = v + N_ACTIONS, *best = w + N_ACTIONS;
+  double j = 0, before, best_value, check = 0;
+  long long step = 0;
+  int i, falls = 0, failed = evaluate(x, in, &j, g);
+  for (i = 0; i < N_ACTIONS; ++i) {
+    v[i] = w[i] = 0;
+    best[i] = x[i];
+    check += g[i];
+  }
+  history[0] = j;
+  *outcome = ITERATION_LIMIT;
+  if (failed || !isfinite(j) || !isfinite(check)) {
+    *value = history[0] = -INFINITY;
+    *outcome = NOT_FINITE;
+    return 1;
+  }
+  best_value = j;
+  while (step < limit) {
+    before = j;
+    for (i = 0; i < N_ACTIONS; ++i) {
+      double span = scaled ? high[i] - low[i] : 1, slope = g[i] * span, delta;
+      v[i] = rho * v[i] + (1 - rho) * slope * slope;
+      delta = slope * sqrt((w[i] + epsilon) / (v[i] + epsilon));
+      w[i] = rho * w[i] + (1 - rho) * delta * delta;
+      x[i] = fmin(fmax(x[i] + delta * span, low[i]), high[i]);
+    }
+    failed = evaluate(x, in, &j, g);
+    check = 0;
+    for (i = 0; i < N_ACTIONS; ++i) check += g[i];
+    if (failed || !isfinite(j) || !isfinite(check)) {
+      j = history[++step] = -INFINITY;
+      *outcome = NOT_FINITE;
+      break;
+    }
+    history[++step] = j;
+    if (j > best_value) {
+      best_value = j;
+      for (i = 0; i < N_ACTIONS; ++i) best[i] = x[i];
+    }
+    if (j >= before && j - before < tolerance) {
+      *outcome = CONVERGED;
+      break;
+    }
+    falls += j < before;
+    if (falls >= oscillation) {
+      *outcome = OSCILLATION;
+      break;
+    }
+  }
+  *value = j;
+  if (keep_best) {
+    for (i = 0; i < N_ACTIONS; ++i) x[i] = best[i];
+    *value = best_value;
+  }
+  return step + 1;
+}
