@@ -12,11 +12,11 @@ from symgraph.errors import (
 from symgraph.graph import Graph
 from symgraph.model import Model, Parameter, Propagator
 from symgraph.objective import Objective
-from symgraph.slots import Action, Gaussian, Selection, State
-from symgraph.tree import Tree, unroll
 from symgraph.optimizers import Adadelta, Ipopt, Lbfgs
 from symgraph.plan import Plan
 from symgraph.planner import solve
+from symgraph.slots import Action, Gaussian, Selection, State
+from symgraph.tree import Tree, unroll
 
 __all__ = [
     "Action",

@@ -101,7 +101,9 @@ class Diagram:
         if suffix == ".svg":
             path.write_text(self.svg(), encoding="utf-8")
         elif suffix in (".png", ".pdf"):
-            _figure(_drawn(self), f"saving a diagram as {suffix}").savefig(path, dpi=192)  # 2 dots a pixel
+            figure = _figure(_drawn(self), f"saving a diagram as {suffix}")
+            inches = max(figure.get_size_inches())
+            figure.savefig(path, dpi=min(192, 2**15 / inches))  # 2 dots a pixel, as long as they fit the memory
         else:
             raise InputError(
                 f"save({str(path)!r}): unknown suffix {suffix!r}; a diagram is saved as .svg, .png or .pdf"
@@ -115,7 +117,7 @@ class Diagram:
 
 FONT = "Helvetica Neue, Helvetica, Arial, Liberation Sans, Arimo, sans-serif"  # all as wide as Arial
 NAME, SMALL, LEADING = 13, 11, 15  # [px] font sizes of a node's first line and of all else; from line to line
-BOLD = 1.06  # bold letters are this much wider; names and titles are bold
+BOLD = 1.1  # bold letters are so much wider at most; names and titles are bold
 EMS = {  # width of a letter of Arial / font size
     0.22: "ijl'|", 0.28: " .,:;!/\\tfI[]", 0.35: "r-()*\"`{}^", 0.5: "cksvxyzJ", 0.61: "TZF+<=>~",
     0.67: "ABEKPSVXY&", 0.72: "CDHNRUw", 0.78: "GOQ", 0.87: "mM%", 0.98: "W@…—",
@@ -141,8 +143,8 @@ def _box_size(node: DiagramNode) -> Size:
 
 
 def _label(edge: DiagramEdge) -> str:
-    probability = "" if edge.weight is None else f"{edge.weight:.3g}"
-    return f"{edge.label} {probability}".strip()
+    probability = [] if edge.weight is None else [f"{edge.weight:.3g}"]
+    return " · ".join([edge.label] * bool(edge.label) + probability)
 
 
 def _layout(diagram: Diagram) -> Layout:
@@ -166,14 +168,7 @@ FILLS: dict[NodeKind, tuple[str, str, str]] = {  # fill, outline, text
     "reward": ("#fff4d9", "#b87700", INK),
     "cut": ("#ffffff", "#d55e00", "#a34700"),
 }
-MARKS = (
-    "#0072b2",
-    "#d55e00",
-    "#009e73",
-    "#cc79a7",
-    "#e69f00",
-    "#56b4e9",
-)  # of a node's groups, one after the other
+MARKS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # of a node's groups in turn
 HINTS = {"choose": "the planner chooses one of these", "chance": "chance decides for one of these"}
 MARGIN = 16  # [px]
 
@@ -184,9 +179,7 @@ def _drawn(diagram: Diagram) -> ET.Element:
     width = max(layout.width, _width(diagram.title, BOLD * NAME)) + 2 * MARGIN
     height = layout.height + above + 2 * MARGIN
     left, top = (layout.width - width) / 2, -MARGIN - above
-    svg = ET.Element(
-        "svg", xmlns="http://www.w3.org/2000/svg", role="img", style="max-width: 100%; height: auto"
-    )
+    svg = ET.Element("svg", xmlns="http://www.w3.org/2000/svg", role="img", style="max-width: 100%; height: auto")
     _set(svg, width=width, height=height, viewBox=" ".join(map(_text, (left, top, width, height))))
     _set(svg, font_family=FONT, text_anchor="middle")
     ground = Box(layout.width / 2, top + height / 2, width - 1, height - 1)
@@ -317,9 +310,7 @@ def _figure(svg: ET.Element, purpose: str) -> Figure:
             x, y, w, h, rx = (float(have[name]) for name in ("x", "y", "width", "height", "rx"))
             axes.add_patch(FancyBboxPatch((x, y), w, h, f"round,pad=0,rounding_size={rx}", **look))
         elif element.tag == "path":
-            points = [
-                tuple(map(float, pair.split(","))) for pair in re.findall(r"[-\d.]+,[-\d.]+", have["d"])
-            ]
+            points = [tuple(map(float, pair.split(","))) for pair in re.findall(r"[-\d.]+,[-\d.]+", have["d"])]
             step = Spline.CURVE4 if "C" in have["d"] else Spline.LINETO
             axes.add_patch(PathPatch(Spline(points, [Spline.MOVETO, *[step] * (len(points) - 1)]), **look))
         elif element.tag == "text":

@@ -34,9 +34,7 @@ class MissingExtraError(SymgraphError, ImportError):
     """An optional dependency is not installed."""
 
     def __init__(self, module: str, extra: str, purpose: str) -> None:
-        super().__init__(
-            f"{purpose} needs the package '{module}': install it with  pip install 'symgraph[{extra}]'"
-        )
+        super().__init__(f"{purpose} needs the package '{module}': install it with  pip install 'symgraph[{extra}]'")
 
 
 def names(labels: Iterable[str]) -> str:

@@ -1,7 +1,7 @@
 """From tree to ONE symbolic expression: the expected sum of rewards as a function of actions, selections and states.
 
-Node values follow equation (3) of the paper, J_k = Σ over groups Σ_b P_b · J_b, written down once over the whole tree; the
-gradient is CasADi's derivative of that expression, so it contains equation (6) and how actions change variances.
+Node values follow equation (3) of the paper, J_k = Σ over groups Σ_b P_b · J_b, written down once over the whole tree;
+the gradient is CasADi's derivative of that expression, so it contains equation (6) and how actions change variances.
 
 A choice becomes a CasADi switch over one function per branch: only the selected branch is evaluated, in the value and
 in every derivative. A product with a one-hot factor would evaluate them all, and 0 · NaN would poison the sum.
@@ -57,7 +57,9 @@ class Inputs:
             label: ca.reshape(part, states[label], states[label])
             for label, part in zip(self.uncertain, covariance_parts, strict=True)
         }
-        self.root.update({label: Gaussian(part, spread.get(label)) for label, part in zip(states, mean_parts, strict=True)})
+        self.root.update(
+            {label: Gaussian(part, spread.get(label)) for label, part in zip(states, mean_parts, strict=True)}
+        )
 
     @property
     def symbols(self) -> list[ca.MX]:

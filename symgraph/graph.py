@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from symgraph.drawing import Diagram, DiagramEdge, DiagramNode
+from symgraph.drawing import Diagram, DiagramEdge, DiagramNode, NodeKind
 from symgraph.errors import GraphError, did_you_mean, names
 from symgraph.model import BoundModel, bind
 from symgraph.slots import Action, Selection, Slot, State
@@ -163,6 +163,7 @@ class Graph:
         """Return the picture of the graph; `diagram().save("graph.svg")` writes it to a file."""
         nodes, edges = [], []
         for name in self.nodes:
+            kind: NodeKind
             kind = "start" if name == self.start else "node" if name in self.groups else "terminal"
             nodes.append(DiagramNode(key=name, lines=(name,), kind=kind))
             for g, group in enumerate(self.groups.get(name, ())):
@@ -170,7 +171,9 @@ class Graph:
                     target = branch.target
                     if target is None:
                         target = f"{name} reward {g}"
-                        nodes.append(DiagramNode(key=target, lines=(branch.model.name if branch.model else "",), kind="reward"))
+                        nodes.append(
+                            DiagramNode(key=target, lines=(branch.model.name if branch.model else "",), kind="reward")
+                        )
                     label = edge_label(group, branch)
                     edges.append(DiagramEdge(source=name, target=target, label=label, group=g, kind=group.kind))
         return Diagram(nodes=tuple(nodes), edges=tuple(edges))
@@ -217,8 +220,6 @@ def edge_label(group: Group, branch: Branch) -> str:
         head = f"{branch.label} ({share:g})"
     model = branch.model.name if branch.model is not None else ""
     return ": ".join(part for part in (head, model) if part)
-
-
 
 
 def _node(name: object, what: str) -> str:

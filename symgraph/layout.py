@@ -10,7 +10,7 @@ import contextlib
 import io
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -18,6 +18,8 @@ Point = tuple[float, float]  # x to the right, y down [px]
 Size = tuple[int, int]  # width, height [px]
 
 PAGE = 1000  # [px] what is wider does not fit a notebook
+HEAD = 7.5  # [px] length of an arrow's head
+REACH = 22  # [px] of an arrow from a box to itself
 
 
 class Arrow(NamedTuple):
@@ -68,10 +70,82 @@ def place(boxes: Sequence[Size], arrows: Sequence[Arrow]) -> Layout:
     Returns:
         the layout, the same for the same input.
     """
-    layout = _read(_dot(boxes, arrows, down=True))
-    if layout.width <= PAGE:
-        return layout
-    return min(layout, _read(_dot(boxes, arrows, down=False)), key=lambda layout: layout.width)
+    rightward = _placed(boxes, arrows, down=False)
+    enough = max(PAGE, rightward.width)
+    ranks: dict[float, float] = {}  # how wide they are, at least, when they run downwards
+    for i, (width, _) in enumerate(boxes):
+        rank = rightward.boxes[i].x
+        ranks[rank] = ranks.get(rank, 0.0) + width
+    if max(ranks.values(), default=0.0) > enough:
+        return rightward
+    downward = _placed(boxes, arrows, down=True)
+    return downward if downward.width <= enough else rightward
+
+
+def _placed(boxes: Sequence[Size], arrows: Sequence[Arrow], down: bool) -> Layout:
+    loops: dict[int, dict[int, Size]] = {}  # box → its arrows to itself → their labels
+    for i, arrow in enumerate(arrows):
+        if arrow.tail == arrow.head:
+            loops.setdefault(arrow.tail, {})[i] = arrow.label or (0, 0)
+    upward = _upward(len(boxes), arrows)
+    forest = not loops and not upward and len({arrow.head for arrow in arrows}) == len(arrows)
+    layout = _read(_dot(boxes, arrows, loops, upward, forest, down))
+    for box, labels in loops.items():
+        _add_loops(layout, layout.boxes[box], labels, down)
+    if forest:
+        _bend_between_ranks(layout, arrows, down)
+    return layout
+
+
+def _pitch(labels: Iterable[Size], down: bool) -> int:
+    """Return the way from one loop to the next, along the side of their box [px]."""
+    return max(height if down else width + 6 for width, height in [(12, 16), *labels])
+
+
+def _add_loops(layout: Layout, box: Box, labels: Mapping[int, Size], down: bool) -> None:
+    """Add a box's arrows to itself, one beside the other: Graphviz draws them into each other."""
+
+    def point(out: float, along: float) -> Point:
+        if down:
+            return box.x + box.width / 2 + out, box.y + along
+        return box.x + along, box.y - box.height / 2 - out
+
+    pitch = _pitch(labels.values(), down)
+    for i, (number, (width, height)) in enumerate(labels.items()):
+        along = (i - (len(labels) - 1) / 2) * pitch
+        leave, arrive = point(0, along - 4), point(6.5, along + 4)
+        points = [leave, point(REACH, along - 8), point(REACH, along + 8), arrive]
+        layout.arrows[number] = [Curve(points, point(0, along + 2))]
+        if height:
+            layout.labels[number] = point(0.75 * REACH + 2 + (width if down else height) / 2, along)
+
+
+def _bend_between_ranks(layout: Layout, arrows: Sequence[Arrow], down: bool) -> None:
+    """Redraw a forest's arrows, all of which lead to the next rank: straight within ranks, bent between them.
+
+    Graphviz leaves the bends any room there is, and so lets arrows of one group cross each other.
+    """
+    axis = 1 if down else 0
+    sizes = [(box[axis], box[2 + axis]) for box in layout.boxes.values()]
+    sizes += [(centre[axis], (arrows[i].label or (0, 0))[axis]) for i, centre in layout.labels.items()]
+    depth: dict[float, float] = {}  # rank → its size along the arrows; boxes and labels stand in its middle
+    for rank, size in sizes:
+        depth[rank] = max(depth.get(rank, 0.0), size)
+
+    def level(point: Point, along: float) -> Point:
+        return (point[0], along) if down else (along, point[1])
+
+    for i, arrow in enumerate(arrows):
+        label = [layout.labels[i]] if i in layout.labels else []
+        stops = [layout.boxes[arrow.tail][:2], *label, layout.boxes[arrow.head][:2]]
+        for k, (points, tip) in enumerate(layout.arrows[i]):
+            start, goal = points[0], tip or points[-1]
+            base = level(goal, goal[axis] - (HEAD if tip else 0))
+            rank, next_rank = stops[k][axis], stops[k + 1][axis]
+            after, before = rank + depth[rank] / 2, min(next_rank - depth[next_rank] / 2, base[axis])
+            middle = (after + before) / 2
+            bend = [level(start, after), level(start, middle), level(goal, middle), level(goal, before)]
+            layout.arrows[i][k] = Curve([start, start, bend[0], *bend, bend[-1], base, base], tip)
 
 
 def _read(dot: str) -> Layout:
@@ -94,47 +168,58 @@ def _read(dot: str) -> Layout:
             size = 72 * float(box["width"]), 72 * float(box["height"])
             layout.boxes[int(box["number"])] = Box(*point(box["pos"]), *size)
     for piece in sorted(placed.get("edges", ()), key=lambda piece: int(piece["part"])):
+        if "number" not in piece:
+            continue  # it kept room free
         words = piece["pos"].split()
         points = [point(word) for word in words if word[0] not in "se"]
         tips = [point(word[2:]) for word in words if word[0] in "se"]
         if piece["dir"] == "back":
             points.reverse()
         layout.arrows.setdefault(int(piece["number"]), []).append(Curve(points, tips[0] if tips else None))
-        if "lp" in piece:
-            layout.labels[int(piece["number"])] = point(piece["lp"])
     return layout
 
 
-def _dot(boxes: Sequence[Size], arrows: Sequence[Arrow], down: bool) -> str:
+def _dot(
+    boxes: Sequence[Size],
+    arrows: Sequence[Arrow],
+    loops: Mapping[int, Mapping[int, Size]],
+    upward: set[int],
+    forest: bool,
+    down: bool,
+) -> str:
     """Return what is to be placed in Graphviz's language, for which a pixel is 1/72 inch."""
     entry, leave = ("n", "s") if down else ("w", "e")
-    upward = _upward(len(boxes), arrows)
-    # What meets a box at its lower side: each group at one place, apart from the arrows that close loops.
+    # What meets a box where its arrows leave: each group at one place, what closes a loop at another (None).
     exits: list[list[int | None]] = [[] for _ in boxes]
     for i, arrow in enumerate(arrows):
         box, place = (arrow.head, None) if i in upward else (arrow.tail, arrow.group)
         if arrow.tail != arrow.head and place not in exits[box]:
             exits[box].append(place)
-    tree = len({arrow.head for arrow in arrows}) == len(arrows) == len(boxes) - 1
-
     lines = [
-        f"digraph {{ rankdir={'TB' if down else 'LR'}; nodesep={0.3 if down else 0.15}; ranksep=0.3;",
-        "ordering=out;" if tree else "",  # branches as declared; elsewhere so that few arrows cross
-        'node [shape=box, label="", margin=0, is=box]; edge [arrowsize=0.75, part=0, dir=forward];',
+        "digraph {",
+        "rankdir=TB; nodesep=0.3; ranksep=0.3;" if down else "rankdir=LR; nodesep=0.15; ranksep=0.4;",
+        f'node [shape=box, label="", margin=0, is=box]; edge [arrowsize={HEAD / 10}, part=0, dir=forward];',
     ]
-    for i, size in enumerate(boxes):
+    if forest:
+        lines.append("ordering=out; splines=line;")  # in the order given; elsewhere so that few arrows cross
+    for i, (width, height) in enumerate(boxes):
+        size = width, height
+        if labels := loops.get(i, {}).values():
+            length = len(labels) * _pitch(labels, down)
+            size = (width, max(height, length)) if down else (max(width, length), height)
+            room = (max(w for w, _ in labels) + REACH, 1) if down else (1, max(h for _, h in labels) + REACH)
+            lines.append(f"box{i} -> box{i} [label={_table([room], down)}];")
         lines.append(f"box{i} [number={i}, {_shape(size, len(exits[i]), down)}];")
     for i, arrow in enumerate(arrows):
         tail, head, label = f"box{arrow.tail}", f"box{arrow.head}", f"label{i}"
         if arrow.tail == arrow.head:
-            lines.append(f"{tail} -> {head} [number={i}, label={_table([arrow.label or (0, 0)], down)}];")
             continue
         # An arrow that closes a loop goes against the ranks: it is laid out as if it ran the other way.
         if i in upward:
             first, last, way = _port(head, exits[arrow.head], None, leave), tail, "dir=back"
         else:
             first, last, way = _port(tail, exits[arrow.tail], arrow.group, leave), head, "dir=forward"
-            last += f":{entry}" if tree else ""
+            last += f":{entry}" if forest else ""
         if arrow.label is None:
             lines.append(f"{first} -> {last} [number={i}, {way}];")
         else:

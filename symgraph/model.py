@@ -101,11 +101,13 @@ class Model:
             raise GraphError(f"{function!r} is not a model; give a function of slots, a Model or a network")
         if propagation is not None and propagation not in RULES:
             raise GraphError(
-                f"model {self.name!r}: propagation = {propagation!r} is not a rule{did_you_mean(str(propagation), RULES)}."
-                f" Rules: {names(RULES)}"
+                f"model {self.name!r}: propagation = {propagation!r} is not a rule"
+                f"{did_you_mean(str(propagation), RULES)}. Rules: {names(RULES)}"
             )
         if propagation is not None and _is_propagator(function):
-            raise GraphError(f"model {self.name!r} propagates Gaussians by itself; leave out propagation={propagation!r}")
+            raise GraphError(
+                f"model {self.name!r} propagates Gaussians by itself; leave out propagation={propagation!r}"
+            )
 
     def __repr__(self) -> str:
         return f"Model({self.name})"
@@ -127,7 +129,7 @@ class BoundModel:
         self.name = model.name
         self.place = place
         self.reads = tuple(dict.fromkeys(reads.values()))  # labels, each once
-        self.writes = {label: size for label, size in writes.values()}
+        self.writes = dict(writes.values())
         self.parameters: tuple[Parameter, ...] = tuple(getattr(model.function, "parameters", ()))
         self._function = model.function
         self._reads = dict(reads)  # its own name → label
@@ -160,7 +162,6 @@ class BoundModel:
 
     def _build_function(self, uncertain: tuple[str, ...]) -> ca.Function:
         # SX evaluates scalar by scalar and is far faster; MX serves functions that call what SX cannot hold.
-        assert self._rule is not None
         try:
             kind: Any = ca.SX
             x, y = self._trace(kind)
@@ -168,7 +169,7 @@ class BoundModel:
             kind = ca.MX
             x, y = self._trace(kind)
         sigma = {label: kind.sym(f"{label}_cov", self._sizes[label], self._sizes[label]) for label in uncertain}
-        moments = [RULES[self._rule](y[label], x, sigma) for label in self.writes]
+        moments = [RULES[str(self._rule)](y[label], x, sigma) for label in self.writes]
         covariances = [
             covariance + kind(ca.DM(self._noise[label])) if label in self._noise else covariance
             for label, (_, covariance) in zip(self.writes, moments, strict=True)
@@ -260,7 +261,9 @@ def _reads(function: Any, place: str) -> list[str]:
     try:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
-        raise GraphError(f"{place} shows no parameter names; wrap it in a function whose parameters are slots") from None
+        raise GraphError(
+            f"{place} shows no parameter names; wrap it in a function whose parameters are slots"
+        ) from None
     starred = [p for p in parameters if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
     if starred:
         raise GraphError(f"{place} has the parameter '*{starred[0].name}'; name each slot that it reads")
@@ -377,7 +380,7 @@ def _call_propagator(
         raise GraphError(f"{place}: propagate returned {names(returned)}, its writes are {names(function.writes)}")
     symbolic = {}
     for name, g in returned.items():
-        mean = ca.MX(g.mean if np.isscalar(g.mean) or isinstance(g.mean, ca.MX) else ca.DM(g.mean))
+        mean = g.mean if isinstance(g.mean, ca.MX) else ca.MX(ca.DM(g.mean))
         covariance = g.covariance if isinstance(g.covariance, ca.MX) else ca.MX(ca.sparsify(ca.DM(g.covariance)))
         symbolic[name] = Gaussian(mean, covariance)
     return symbolic

@@ -65,8 +65,8 @@ class Build:
         if (iterations, tolerance) not in self._solvers:
             expectation = self.expectation
             actions, *others = expectation.inputs.symbols
-            problem = {"x": actions, "p": ca.veccat(*others), "f": -expectation.value}
-            options = {
+            problem: Any = {"x": actions, "p": ca.veccat(*others), "f": -expectation.value}
+            options: Any = {
                 "print_time": False,
                 "error_on_fail": False,
                 "show_eval_warnings": False,
@@ -114,7 +114,10 @@ class Objective:
         self._builds: dict[frozenset[str], Build] = {}
 
     def value(
-        self, state: Mapping[str, Any], actions: Mapping[str, Any] | None = None, selections: Mapping[str, str] | None = None
+        self,
+        state: Mapping[str, Any],
+        actions: Mapping[str, Any] | None = None,
+        selections: Mapping[str, str] | None = None,
     ) -> float:
         """Return the expected sum of rewards.
 
@@ -129,13 +132,19 @@ class Objective:
         return float(self._evaluate(state, actions, selections)[0][0])
 
     def gradient(
-        self, state: Mapping[str, Any], actions: Mapping[str, Any] | None = None, selections: Mapping[str, str] | None = None
+        self,
+        state: Mapping[str, Any],
+        actions: Mapping[str, Any] | None = None,
+        selections: Mapping[str, str] | None = None,
     ) -> dict[str, Any]:
         """Return ∂J/∂action for each action label, a float for a scalar, else (size,) [reward/unit]; see `value`."""
         return self.unstack(self._evaluate(state, actions, selections)[1])
 
     def hessian(
-        self, state: Mapping[str, Any], actions: Mapping[str, Any] | None = None, selections: Mapping[str, str] | None = None
+        self,
+        state: Mapping[str, Any],
+        actions: Mapping[str, Any] | None = None,
+        selections: Mapping[str, str] | None = None,
     ) -> Array:
         """Return ∂²J/∂actions², (n, n) over the stacked actions in graph order; see `value`."""
         situation = self.situation(state)
@@ -159,13 +168,18 @@ class Objective:
         columns = np.asarray(points, dtype=float)
         n = self.n_actions
         if columns.ndim != 2 or columns.shape[0] != n:
-            raise InputError(f"points has shape {columns.shape}; give ({n}, P): the {n} stacked actions, a column per point")
+            raise InputError(
+                f"points has shape {columns.shape}; give ({n}, P): the {n} stacked actions, a column per point"
+            )
         chosen = np.tile(self.one_hot(selections), (columns.shape[1], 1))
         values, gradients = situation.build.kernel.bind(situation.shared).evaluate(columns.T, chosen)
         return values, gradients.T
 
     def outcomes(
-        self, state: Mapping[str, Any], actions: Mapping[str, Any] | None = None, selections: Mapping[str, str] | None = None
+        self,
+        state: Mapping[str, Any],
+        actions: Mapping[str, Any] | None = None,
+        selections: Mapping[str, str] | None = None,
     ) -> NodeOutcomes:
         """Return what happens at every node: probability, the slots' Gaussians, reward and value; see `value`."""
         situation = self.situation(state)
@@ -199,9 +213,7 @@ class Objective:
             others = f" Missing in all: {names(missing)}." if len(missing) > 1 else ""
             hint = did_you_mean(label, [x for x in given if x not in self.tree.needed_states])
             raise InputError(f"state {label!r} is missing: {place} reads it{hint}.{others}")
-        uncertain = frozenset(
-            label for label in self.tree.needed_states if isinstance(state[label], Gaussian)
-        )
+        uncertain = frozenset(label for label in self.tree.needed_states if isinstance(state[label], Gaussian))
         if uncertain not in self._builds:
             self._builds[uncertain] = Build(self.tree, uncertain, self._compiled)
         empty = [np.zeros(0)]
@@ -260,9 +272,13 @@ class Objective:
         slots = self.graph.slots
         slot = slots.get(label)
         if slot is None:
-            raise InputError(f"state {label!r} is not a slot{did_you_mean(label, slots)}. States: {names(self.graph.states())}")
+            raise InputError(
+                f"state {label!r} is not a slot{did_you_mean(label, slots)}. States: {names(self.graph.states())}"
+            )
         if isinstance(slot, Action):
-            raise InputError(f"{label!r} is an action, not a state: the planner chooses it; to hold it give fixed={{{label!r}: …}}")
+            raise InputError(
+                f"{label!r} is an action, not a state: the planner chooses it; to hold it give fixed={{{label!r}: …}}"
+            )
         if isinstance(slot, Selection):
             raise InputError(f"{label!r} is a selection, not a state: give it as selections= or fixed=")
         if isinstance(value, Gaussian):
@@ -277,7 +293,9 @@ class Objective:
             raise InputError(f"{kind}s is {type(given).__name__}; give {{label: value}}")
         for label in given:
             if label not in slots:
-                raise InputError(f"{label!r} is no {kind}{did_you_mean(str(label), slots)}. {kind.capitalize()}s: {names(slots)}")
+                raise InputError(
+                    f"{label!r} is no {kind}{did_you_mean(str(label), slots)}. {kind.capitalize()}s: {names(slots)}"
+                )
 
 
 def checked_column(value: Any, size: int, place: str) -> Array:
@@ -305,5 +323,3 @@ def stacked_index(slots: Mapping[str, Slot]) -> dict[str, slice]:
         where[label] = slice(at, at + slot.size)
         at += slot.size
     return where
-
-

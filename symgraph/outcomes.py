@@ -214,7 +214,9 @@ class NodeOutcomes(Sequence[NodeOutcome]):
                 if isinstance(tree_group.group.probability, BoundModel):
                     total = sum(self.shares[b.child] for b in tree_group.branches if b.child is not None)
                     if not abs(total - 1.0) <= 1e-6:
-                        found.append(f"the probabilities at {self.tree.path(node.index)!r} sum to {total:.6g}, not to 1")
+                        found.append(
+                            f"the probabilities at {self.tree.path(node.index)!r} sum to {total:.6g}, not to 1"
+                        )
         cut = sum(self.probabilities[node.index] for node in self.tree.nodes if node.cut)
         if cut:
             found.append(

@@ -86,7 +86,9 @@ class Plan:
 
     def _quantity(self, label: str, value: Any) -> str:
         numbers = ", ".join(f"{x:.5g}" for x in np.ravel(value))
-        return " ".join(part for part in (f"[{numbers}]" if np.ndim(value) else numbers, self.units.get(label, "")) if part)
+        return " ".join(
+            part for part in (f"[{numbers}]" if np.ndim(value) else numbers, self.units.get(label, "")) if part
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the plan as dictionaries, lists, strings and numbers, fit for JSON."""

@@ -68,6 +68,7 @@ def solve(
     selections = _selections(objective, best)
     columns = [best.point, objective.one_hot(selections), *situation.shared]
     nodes = situation.build.outcomes(columns, selections, situation.given)
+    planned_or_seen = {**objective.graph.actions(), **objective.graph.states()}
     return Plan(
         actions=objective.unstack(best.point),
         selections=selections,
@@ -79,7 +80,7 @@ def solve(
         optimizer=type(optimizer).__name__,
         seed=int(seed),
         seconds=time.perf_counter() - begin,
-        units={label: slot.unit for label, slot in objective.graph.slots.items() if getattr(slot, "unit", "")},
+        units={label: slot.unit for label, slot in planned_or_seen.items() if slot.unit},
     )
 
 
@@ -147,7 +148,9 @@ def _planned_slot(objective: Objective, label: str, place: str) -> Action | Sele
         return slot
     planned = [name for name, s in slots.items() if isinstance(s, (Action, Selection))]
     if slot is not None:
-        raise InputError(f"{place}: {label!r} is a state; give it in the state. Actions and selections: {names(planned)}")
+        raise InputError(
+            f"{place}: {label!r} is a state; give it in the state. Actions and selections: {names(planned)}"
+        )
     hint = did_you_mean(str(label), planned)
     raise InputError(f"{place}: {label!r} is no action or selection{hint}. Actions and selections: {names(planned)}")
 

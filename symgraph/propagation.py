@@ -31,7 +31,7 @@ def linear(y: Any, x: Mapping[str, Any], covariance: Mapping[str, Any]) -> Momen
 
 
 def second_order(y: Any, x: Mapping[str, Any], covariance: Mapping[str, Any]) -> Moments:
-    """Add the curvature to the mean: E[y_k] = f_k(μ) + ½ Σᵢ tr(H_ki Σᵢ), cov[y] as in `linear`; exact for quadratics."""
+    """Add the curvature to the mean: E[y_k] = f_k(μ) + ½ Σᵢ tr(H_ki Σᵢ); the covariance is that of `linear`."""
     curvature = []
     for k in range(y.numel()):
         terms = [ca.trace(ca.mtimes(ca.hessian(y[k], x[label])[0], sigma)) for label, sigma in covariance.items()]

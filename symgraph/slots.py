@@ -268,4 +268,5 @@ def as_covariance(value: Any, size: int, place: str) -> Array:
             f"{place}: covariance has the negative {'variance' if size == 1 else 'eigenvalue'} {smallest:g}; "
             f"it must be positive semi-definite"
         )
-    return (matrix + matrix.T) / 2
+    symmetric: Array = (matrix + matrix.T) / 2
+    return symmetric

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
-from symgraph.drawing import Diagram, DiagramEdge, DiagramNode
+from symgraph.drawing import Diagram, DiagramEdge, DiagramNode, NodeKind
 from symgraph.errors import GraphError, did_you_mean, names
 from symgraph.graph import Branch, Graph, Group, edge_label
 from symgraph.model import BoundModel
@@ -27,6 +27,8 @@ class TreeBranch:
 
 @dataclass(frozen=True)
 class TreeGroup:
+    """A group of a tree node, with the branches that can still happen on the way here."""
+
     group: Group
     branches: tuple[TreeBranch, ...]
 
@@ -96,7 +98,9 @@ class Tree:
                 found.update({b.branch.model: None for b in tree_group.branches if b.branch.model is not None})
         return tuple(found)
 
-    def diagram(self, notes: Mapping[int, tuple[str, ...]] | None = None, probability: Mapping[int, float] | None = None) -> Diagram:
+    def diagram(
+        self, notes: Mapping[int, tuple[str, ...]] | None = None, probability: Mapping[int, float] | None = None
+    ) -> Diagram:
         """Return the picture of the tree; `diagram().save("tree.svg")` writes it to a file.
 
         Args:
@@ -106,6 +110,7 @@ class Tree:
         notes, probability = notes or {}, probability or {}
         nodes, edges = [], []
         for node in self.nodes:
+            kind: NodeKind
             kind = "cut" if node.cut else "start" if node.parent is None else "node" if node.groups else "terminal"
             pale = probability.get(node.index, 1.0) == 0.0
             key = str(node.index)
@@ -126,7 +131,13 @@ class Tree:
                         weight = reach if tree_group.group.kind == "chance" else None
                     edges.append(
                         DiagramEdge(
-                            source=key, target=target, label=label, group=g, kind=tree_group.group.kind, muted=muted, weight=weight
+                            source=key,
+                            target=target,
+                            label=label,
+                            group=g,
+                            kind=tree_group.group.kind,
+                            muted=muted,
+                            weight=weight,
                         )
                     )
         return Diagram(nodes=tuple(nodes), edges=tuple(edges))
@@ -149,7 +160,7 @@ def unroll(graph: Graph, max_visits: int = 3, start: str | None = None, cut_valu
         graph: the task.
         max_visits: times one node may recur on a path from the start; one more visit is cut.
         start: plan from this node on instead of the graph's start.
-        cut_value: what a cut branch is worth [reward]; 0 beats every negative reward, so plans say when they may be cut.
+        cut_value: worth of a cut branch [reward]; 0 beats every negative reward, so plans say when they can be cut.
 
     Raises:
         GraphError: a start that no call mentions, unreachable nodes, settings that are not numbers, a tree too large.
@@ -164,7 +175,10 @@ def unroll(graph: Graph, max_visits: int = 3, start: str | None = None, cut_valu
     known = [node for node in graph.nodes if node != graph.start or _mentioned(graph, node)]
     for name in dict.fromkeys((graph.start, graph.start if start is None else start)):
         if name not in known:
-            raise GraphError(f"start node {name!r} is in no edge, choose, chance or reward{did_you_mean(name, known)}. Nodes: {names(known)}")
+            raise GraphError(
+                f"start node {name!r} is in no edge, choose, chance or reward{did_you_mean(name, known)}."
+                f" Nodes: {names(known)}"
+            )
     graph.check_reachable()
     return _Unroller(graph, max_visits, float(cut_value)).run(graph.start if start is None else start)
 
@@ -202,7 +216,9 @@ class _Unroller:
             cut = times > self._max_visits
             visits.append({**before, arrival.name: times} if not cut else before)
             index = len(nodes)
-            groups = () if cut else tuple(self._group(g, index, arrival) for g in self._graph.groups.get(arrival.name, ()))
+            groups = (
+                () if cut else tuple(self._group(g, index, arrival) for g in self._graph.groups.get(arrival.name, ()))
+            )
             nodes.append(TreeNode(index, arrival.name, arrival.parent, arrival.step, cut, groups))
             if len(self._arrivals) > MAX_NODES:
                 raise GraphError(
@@ -236,5 +252,3 @@ class _Unroller:
                 self._arrivals.append(_Arrival(branch.target, parent, step, further))
             branches.append(TreeBranch(branch, share, child))
         return TreeGroup(group, tuple(branches))
-
-

@@ -98,7 +98,8 @@ class CompiledKernel(Kernel):
 
     def _load(self) -> None:
         library = load(self._source, self._compiler)
-        pointer, whole, number = ctypes.c_void_p, ctypes.c_longlong, ctypes.c_double
+        pointer: Any = ctypes.c_void_p
+        whole, number = ctypes.c_longlong, ctypes.c_double
         library.symgraph_evaluate.argtypes = [whole, *[pointer] * 6]
         library.symgraph_evaluate.restype = None
         library.symgraph_climb.argtypes = [*[pointer] * 5, whole, number, *[pointer] * 4]
@@ -146,12 +147,16 @@ class _BoundCompiled(BoundKernel):
         )
         return values, gradients
 
-    def climb(self, start: Array, selection: Array, low: Array, high: Array, iterations: int, tolerance: float) -> Ended:
+    def climb(
+        self, start: Array, selection: Array, low: Array, high: Array, iterations: int, tolerance: float
+    ) -> Ended:
         return self._search(
             self._kernel.library.symgraph_climb, start, selection, low, high, iterations, (iterations, tolerance)
         )
 
-    def ascend(self, start: Array, selection: Array, low: Array, high: Array, limit: int, steps: AdadeltaSteps) -> Ended:
+    def ascend(
+        self, start: Array, selection: Array, low: Array, high: Array, limit: int, steps: AdadeltaSteps
+    ) -> Ended:
         settings = (
             limit,
             steps.decay,
@@ -164,7 +169,14 @@ class _BoundCompiled(BoundKernel):
         return self._search(self._kernel.library.symgraph_ascend, start, selection, low, high, limit + 1, settings)
 
     def _search(
-        self, function: Any, start: Array, selection: Array, low: Array, high: Array, length: int, settings: tuple[Any, ...]
+        self,
+        function: Any,
+        start: Array,
+        selection: Array,
+        low: Array,
+        high: Array,
+        length: int,
+        settings: tuple[Any, ...],
     ) -> Ended:
         point = np.array(start, dtype=float)
         selection, low, high = _contiguous(selection), _contiguous(low), _contiguous(high)

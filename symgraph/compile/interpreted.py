@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -16,13 +17,15 @@ class FlatFunction:
 
     def __init__(self, function: ca.Function) -> None:
         self._function = function
-        self._buffer, self._evaluate = function.buffer()
+        buffer: Any
+        buffer, self._evaluate = function.buffer()
+        self._buffer = buffer  # kept alive: it owns what evaluate reads
         self._inputs = [np.zeros(function.nnz_in(i)) for i in range(function.n_in())]
         self._outputs = [np.zeros(function.nnz_out(i)) for i in range(function.n_out())]
         for i, column in enumerate(self._inputs):
-            self._buffer.set_arg(i, memoryview(column))
+            buffer.set_arg(i, column.data)
         for i, column in enumerate(self._outputs):
-            self._buffer.set_res(i, memoryview(column))
+            buffer.set_res(i, column.data)
 
     def __call__(self, columns: Sequence[Array]) -> list[Array]:
         """Return the results, each flat in column-major order."""
@@ -56,7 +59,9 @@ class _BoundInterpreted(BoundKernel):
             values[p], gradients[p] = self._at(actions[p], selections[p])
         return values, gradients
 
-    def climb(self, start: Array, selection: Array, low: Array, high: Array, iterations: int, tolerance: float) -> Ended:
+    def climb(
+        self, start: Array, selection: Array, low: Array, high: Array, iterations: int, tolerance: float
+    ) -> Ended:
         from scipy.optimize import Bounds, minimize
 
         span = high - low
@@ -83,7 +88,9 @@ class _BoundInterpreted(BoundKernel):
             outcome = {0: "converged", 1: "iteration limit"}.get(int(found.status), "stalled")  # type: ignore[assignment]
         return Ended(best.point, best.value, outcome, np.array(history))
 
-    def ascend(self, start: Array, selection: Array, low: Array, high: Array, limit: int, steps: AdadeltaSteps) -> Ended:
+    def ascend(
+        self, start: Array, selection: Array, low: Array, high: Array, limit: int, steps: AdadeltaSteps
+    ) -> Ended:
         x = start.copy()
         span = high - low if steps.scaled else np.ones_like(low)
         value, gradient = self._at(x, selection)

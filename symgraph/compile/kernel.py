@@ -14,9 +14,7 @@ from symgraph.compile.library import find_compiler
 from symgraph.errors import CompileError
 from symgraph.slots import Array
 
-Outcome = Literal[
-    "converged", "iteration limit", "oscillation", "stalled", "not finite", "worker died", "interrupted"
-]
+Outcome = Literal["converged", "iteration limit", "oscillation", "stalled", "not finite", "worker died", "interrupted"]
 
 
 @dataclass(frozen=True)
@@ -67,19 +65,24 @@ class BoundKernel(ABC):
         """
 
     @abstractmethod
-    def climb(self, start: Array, selection: Array, low: Array, high: Array, iterations: int, tolerance: float) -> Ended:
+    def climb(
+        self, start: Array, selection: Array, low: Array, high: Array, iterations: int, tolerance: float
+    ) -> Ended:
         """Climb from one point to a local maximum within the bounds by L-BFGS.
 
         Args:
             start: (n,) actions.
             selection: (m,) one-hot.
-            low, high: (n,) bounds.
+            low: (n,) lower bounds.
+            high: (n,) upper bounds.
             iterations: gradients at most.
             tolerance: largest element of the projected gradient over (x − low)/(high − low), relative to 1 + |J|.
         """
 
     @abstractmethod
-    def ascend(self, start: Array, selection: Array, low: Array, high: Array, limit: int, steps: AdadeltaSteps) -> Ended:
+    def ascend(
+        self, start: Array, selection: Array, low: Array, high: Array, limit: int, steps: AdadeltaSteps
+    ) -> Ended:
         """Move one point by ADADELTA for at most `limit` steps.
 
         On gradient g:  v ← ρv + (1 − ρ)g²,  Δ = g √(w + ε)/√(v + ε),  w ← ρw + (1 − ρ)Δ²,  x ← clip(x + Δ).

@@ -20,7 +20,7 @@ from symgraph.errors import CompileError
 
 # Strict IEEE arithmetic: NaN and infinity must survive to be noticed. errno and floating-point traps are what C has
 # to keep up for nobody here.
-FLAGS = ("-O2", "-fPIC", "-std=c99", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast")
+FLAGS = ("-O1", "-fPIC", "-std=c99", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast")
 
 
 @cache
@@ -65,7 +65,7 @@ def _compile(source: str, compiler: str, path: Path) -> None:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             raise CompileError(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")
-        os.replace(made, path)
+        made.replace(path)
 
 
 def _private_folder() -> Path:

@@ -27,8 +27,8 @@ class Adadelta(Optimizer):
 
     A point is taken from the queue, moved for at most `run_iterations` steps and ends a run (1) converged:
     0 ≤ J_new − J < tolerance, (2) at the iteration limit, or (3) oscillating: `oscillation` steps lowered J.
-    Case (1) joins the finished list, (2) and (3) only when better than all so far; with `requeue`, every point then goes
-    back to the queue. The search ends when (a) `finished` points are finished, (b) the queue is empty, or
+    Case (1) joins the finished list, (2) and (3) only when better than all so far; with `requeue`, every point then
+    goes back to the queue. The search ends when (a) `finished` points are finished, (b) the queue is empty, or
     (c) `total_iterations` are spent. From a queue that points come back to, the next is the best point (probability
     0.4), a random one (0.3), or else the worst is dropped for a perturbed copy of the best finished point.
 
@@ -132,7 +132,8 @@ class Adadelta(Optimizer):
                         spent += len(run.history) - 1
                         best = best_of(finished)
                         if run.outcome == "converged" or (
-                            run.outcome in ("iteration limit", "oscillation") and (best is None or run.value > best.value)
+                            run.outcome in ("iteration limit", "oscillation")
+                            and (best is None or run.value > best.value)
                         ):
                             finished.append(run)
                         if self.requeue and run.outcome in ("converged", "iteration limit", "oscillation"):
@@ -148,9 +149,7 @@ class Adadelta(Optimizer):
 
     @property
     def _steps(self) -> AdadeltaSteps:
-        return AdadeltaSteps(
-            self.decay, self.epsilon, self.tolerance, self.oscillation, self.scaled, self.keep_best
-        )
+        return AdadeltaSteps(self.decay, self.epsilon, self.tolerance, self.oscillation, self.scaled, self.keep_best)
 
     @staticmethod
     def _polished(problem: Problem, runs: list[Run]) -> tuple[list[Run], bool]:
@@ -212,7 +211,9 @@ class _Queue:
         return Run(point, point, best.choices, -np.inf, "iteration limit", np.zeros(0))
 
 
-def _move(kernel: BoundKernel, box: tuple[Array, Array], points: Array, hot: Array, limit: int, steps: AdadeltaSteps) -> list[Ended]:
+def _move(
+    kernel: BoundKernel, box: tuple[Array, Array], points: Array, hot: Array, limit: int, steps: AdadeltaSteps
+) -> list[Ended]:
     """Move points (P, n) one after the other; at the top level so that worker processes find it."""
     return [kernel.ascend(point, one_hot, *box, limit, steps) for point, one_hot in zip(points, hot, strict=True)]
 

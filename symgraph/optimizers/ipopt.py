@@ -11,7 +11,6 @@ from symgraph.optimizers.lbfgs import positive_whole, promising_points
 from symgraph.optimizers.problem import Choices, Optimizer, Problem, Run, Search
 from symgraph.slots import Array
 
-
 _OUTCOMES: dict[str, Outcome] = {
     "Solve_Succeeded": "converged",
     "Solved_To_Acceptable_Level": "converged",

@@ -1,4 +1,4 @@
-"""What an optimizer sees of a task: a box of actions, choices of selections, values and gradients; and what it returns."""
+"""What an optimizer sees of a task, a box of actions with values and gradients, and what it returns."""
 
 from __future__ import annotations
 
