@@ -16,7 +16,8 @@ from itertools import accumulate
 
 import casadi as ca
 
-from symgraph.model import REWARD, BoundModel, Parameter
+from symgraph.binding import REWARD, BoundModel
+from symgraph.model import Parameter
 from symgraph.slots import Gaussian
 from symgraph.tree import Tree, TreeGroup
 

@@ -7,9 +7,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from symgraph.binding import BoundModel, bind
 from symgraph.drawing import Diagram, DiagramEdge, DiagramNode, NodeKind
 from symgraph.errors import GraphError, did_you_mean, names
-from symgraph.model import BoundModel, bind
 from symgraph.slots import Action, Selection, Slot, State
 
 Kind = Literal["edge", "choose", "chance", "reward"]

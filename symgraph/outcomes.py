@@ -10,9 +10,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from symgraph.binding import REWARD, BoundModel
 from symgraph.compile.interpreted import FlatFunction
 from symgraph.expectation import Dictionary, Inputs
-from symgraph.model import REWARD, BoundModel
 from symgraph.slots import Array, Gaussian, unchecked_gaussian
 from symgraph.tree import Tree
 

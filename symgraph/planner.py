@@ -14,7 +14,7 @@ from symgraph.optimizers.lbfgs import Lbfgs
 from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
 from symgraph.plan import Plan, PlanRun
 from symgraph.progress import Progress
-from symgraph.slots import Action, Selection
+from symgraph.slots import Action, Selection, State
 
 Guess = Plan | Mapping[str, Any]
 
@@ -68,7 +68,7 @@ def solve(
     selections = _selections(objective, best)
     columns = [best.point, objective.one_hot(selections), *situation.shared]
     nodes = situation.build.outcomes(columns, selections, situation.given)
-    planned_or_seen = {**objective.graph.actions(), **objective.graph.states()}
+    planned_or_seen: dict[str, Action | State] = {**objective.graph.actions(), **objective.graph.states()}
     return Plan(
         actions=objective.unstack(best.point),
         selections=selections,

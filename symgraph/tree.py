@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
+from symgraph.binding import BoundModel
 from symgraph.drawing import Diagram, DiagramEdge, DiagramNode, NodeKind
 from symgraph.errors import GraphError, did_you_mean, names
 from symgraph.graph import Branch, Graph, Group, edge_label
-from symgraph.model import BoundModel
 from symgraph.slots import State
 
 MAX_NODES = 1_000_000  # beyond it memory runs out before the user learns why

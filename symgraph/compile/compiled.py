@@ -99,7 +99,8 @@ class CompiledKernel(Kernel):
     def _load(self) -> None:
         library = load(self._source, self._compiler)
         pointer: Any = ctypes.c_void_p
-        whole, number = ctypes.c_longlong, ctypes.c_double
+        whole: Any = ctypes.c_longlong
+        number: Any = ctypes.c_double
         library.symgraph_evaluate.argtypes = [whole, *[pointer] * 6]
         library.symgraph_evaluate.restype = None
         library.symgraph_climb.argtypes = [*[pointer] * 5, whole, number, *[pointer] * 4]

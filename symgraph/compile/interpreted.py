@@ -82,7 +82,7 @@ class _BoundInterpreted(BoundKernel):
             return best
         outcome: Outcome = "converged"
         if (span > 0.0).any():
-            options = {"maxfun": iterations, "maxiter": iterations, "ftol": 1e-15, "gtol": tolerance, "maxls": 40}
+            options: Any = {"maxfun": iterations, "maxiter": iterations, "ftol": 1e-15, "gtol": tolerance, "maxls": 40}
             box = Bounds(np.zeros(len(u)), (span > 0.0).astype(float))
             found = minimize(descend, u, jac=True, method="L-BFGS-B", bounds=box, options=options)
             outcome = {0: "converged", 1: "iteration limit"}.get(int(found.status), "stalled")  # type: ignore[assignment]
