@@ -15,6 +15,7 @@ from symgraph.objective import Objective
 from symgraph.optimizers import Adadelta, Ipopt, Lbfgs
 from symgraph.plan import Plan
 from symgraph.planner import solve
+from symgraph.plots import plot_runs, plot_value
 from symgraph.slots import Action, Gaussian, Selection, State
 from symgraph.tree import Tree, unroll
 
@@ -40,6 +41,8 @@ __all__ = [
     "State",
     "SymgraphError",
     "Tree",
+    "plot_runs",
+    "plot_value",
     "solve",
     "unroll",
 ]

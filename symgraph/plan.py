@@ -73,7 +73,7 @@ class Plan:
         lines = [f"{label} = {choice}" for label, choice in self.selections.items()]
         lines += [f"{label} = {self._quantity(label, value)}" for label, value in self.actions.items()]
         gradients = sum(run.gradients for run in self.runs)
-        lines.append(f"value {self.value:.6g}: {self.status}")
+        lines.append(f"value {self.value + 0.0:.6g}: {self.status}")
         lines.append(f"  {gradients} gradients in {1e3 * self.seconds:.1f} ms by {self.optimizer}, seed {self.seed}")
         lines += [f"  note: {note}" for note in self.notes]
         reached = [node for node in self.nodes if node.probability > 0.0]
