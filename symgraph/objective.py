@@ -172,7 +172,7 @@ class Objective:
                 f"points has shape {columns.shape}; give ({n}, P): the {n} stacked actions, a column per point"
             )
         chosen = np.tile(self.one_hot(selections), (columns.shape[1], 1))
-        values, gradients = situation.build.kernel.bind(situation.shared).evaluate(columns.T, chosen)
+        values, gradients = situation.build.kernel.bind(situation.shared, *self.bounds).evaluate(columns.T, chosen)
         return values, gradients.T
 
     def outcomes(

@@ -103,7 +103,7 @@ def _problem(
             check_choice(label, value, slot)
             allowed[label] = (slot.choices.index(value),)
     return Problem(
-        kernel=situation.build.kernel.bind(situation.shared),
+        kernel=situation.build.kernel.bind(situation.shared, low, high),
         situation=situation,
         low=low,
         high=high,

@@ -94,6 +94,7 @@ class CompiledKernel(Kernel):
         search = (resources.files("symgraph.compile") / "search.c").read_text()
         self._source = generator.dump() + _HEAD.format(**sizes) + search + _TAIL.format(**sizes)
         self._compiler = compiler
+        self.n_actions, self.n_selections = function.numel_in(0), function.numel_in(1)
         self._load()
 
     def _load(self) -> None:
@@ -112,92 +113,79 @@ class CompiledKernel(Kernel):
         self.work = int(library.symgraph_work())
 
     def __getstate__(self) -> dict[str, Any]:  # other processes load the library from the cache
-        return {"_source": self._source, "_compiler": self._compiler}
+        return {name: value for name, value in self.__dict__.items() if name not in ("library", "work")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._load()
 
-    def bind(self, shared: Sequence[Array]) -> BoundKernel:
-        return _BoundCompiled(self, [_contiguous(column) for column in shared])
+    def bind(self, shared: Sequence[Array], low: Array, high: Array) -> BoundKernel:
+        return _BoundCompiled(self, [contiguous(column) for column in shared], contiguous(low), contiguous(high))
 
 
 class _BoundCompiled(BoundKernel):
-    def __init__(self, kernel: CompiledKernel, shared: list[Array]) -> None:
+    """Hands arrays of its own to the library, since looking up an array's address costs as much as ten gradients."""
+
+    def __init__(self, kernel: CompiledKernel, shared: list[Array], low: Array, high: Array) -> None:
         self._kernel = kernel
-        self._shared = shared
-        pointers = (ctypes.c_void_p * max(1, len(shared)))(*[_address(column) for column in shared])
-        self._pointers = pointers  # kept alive beside their address
-        self._shared_address = ctypes.addressof(pointers)
+        self._inputs = shared, low, high
+        self._pointers = (ctypes.c_void_p * max(1, len(shared)))(*[_address(column) for column in shared])
         self._work = np.empty(kernel.work)
+        self._point, self._selection = np.zeros(kernel.n_actions), np.zeros(kernel.n_selections)
+        self._value, self._outcome = ctypes.c_double(), ctypes.c_int()
+        self._history = np.empty(0)
+        self._before = (
+            _address(self._point),
+            _address(self._selection),
+            ctypes.addressof(self._pointers),
+            _address(low),
+            _address(high),
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _BoundCompiled, (self._kernel, self._shared)
+        return _BoundCompiled, (self._kernel, *self._inputs)
 
     def evaluate(self, actions: Array, selections: Array) -> tuple[Array, Array]:
-        actions, selections = _contiguous(actions), _contiguous(selections)
+        actions, selections = contiguous(actions), contiguous(selections)
         values, gradients = np.empty(len(actions)), np.empty(actions.shape)
         self._kernel.library.symgraph_evaluate(
             len(actions),
             _address(actions),
             _address(selections),
-            self._shared_address,
+            ctypes.addressof(self._pointers),
             _address(values),
             _address(gradients),
             _address(self._work),
         )
         return values, gradients
 
-    def climb(
-        self, start: Array, selection: Array, low: Array, high: Array, iterations: int, tolerance: float
-    ) -> Ended:
-        return self._search(
-            self._kernel.library.symgraph_climb, start, selection, low, high, iterations, (iterations, tolerance)
-        )
+    def climb(self, start: Array, selection: Array, iterations: int, tolerance: float) -> Ended:
+        function = self._kernel.library.symgraph_climb
+        return self._search(function, start, selection, iterations, (iterations, tolerance))
 
-    def ascend(
-        self, start: Array, selection: Array, low: Array, high: Array, limit: int, steps: AdadeltaSteps
-    ) -> Ended:
-        settings = (
-            limit,
-            steps.decay,
-            steps.epsilon,
-            steps.tolerance,
-            steps.oscillation,
-            steps.scaled,
-            steps.keep_best,
-        )
-        return self._search(self._kernel.library.symgraph_ascend, start, selection, low, high, limit + 1, settings)
+    def ascend(self, start: Array, selection: Array, limit: int, steps: AdadeltaSteps) -> Ended:
+        numbers = steps.decay, steps.epsilon, steps.tolerance
+        settings = (limit, *numbers, steps.oscillation, steps.scaled, steps.keep_best)
+        return self._search(self._kernel.library.symgraph_ascend, start, selection, limit + 1, settings)
 
-    def _search(
-        self,
-        function: Any,
-        start: Array,
-        selection: Array,
-        low: Array,
-        high: Array,
-        length: int,
-        settings: tuple[Any, ...],
-    ) -> Ended:
-        point = np.array(start, dtype=float)
-        selection, low, high = _contiguous(selection), _contiguous(low), _contiguous(high)
-        value, outcome, history = ctypes.c_double(), ctypes.c_int(), np.empty(length)
-        spent = function(
-            _address(point),
-            _address(selection),
-            self._shared_address,
-            _address(low),
-            _address(high),
-            *settings,
-            ctypes.addressof(value),
-            ctypes.addressof(outcome),
-            _address(history),
-            _address(self._work),
-        )
-        return Ended(point, value.value, _OUTCOMES[outcome.value], history[:spent].copy())
+    def _search(self, function: Any, start: Array, selection: Array, length: int, settings: tuple[Any, ...]) -> Ended:
+        if self._history.size < length:
+            self._history = np.empty(length)
+            self._after = (
+                ctypes.addressof(self._value),
+                ctypes.addressof(self._outcome),
+                _address(self._history),
+                _address(self._work),
+            )
+        self._point[:] = start
+        self._selection[:] = selection
+        spent = function(*self._before, *settings, *self._after)
+        outcome = _OUTCOMES[self._outcome.value]
+        return Ended(self._point.copy(), self._value.value, outcome, self._history[:spent].copy())
 
 
-def _contiguous(column: Array) -> Array:
+def contiguous(column: Array) -> Array:
+    """Return the column as C sees it: doubles one after the other."""
     return np.ascontiguousarray(column, dtype=float)
 
 

@@ -44,14 +44,16 @@ class InterpretedKernel(Kernel):
     def __init__(self, function: ca.Function) -> None:
         self.function = FlatFunction(function)
 
-    def bind(self, shared: Sequence[Array]) -> BoundKernel:
-        return _BoundInterpreted(self.function, [np.ascontiguousarray(column, dtype=float) for column in shared])
+    def bind(self, shared: Sequence[Array], low: Array, high: Array) -> BoundKernel:
+        return _BoundInterpreted(self.function, list(shared), low, high)
 
 
 class _BoundInterpreted(BoundKernel):
-    def __init__(self, function: FlatFunction, shared: list[Array]) -> None:
+    def __init__(self, function: FlatFunction, shared: list[Array], low: Array, high: Array) -> None:
         self._function = function
         self._shared = shared
+        self._low = low
+        self._high = high
 
     def evaluate(self, actions: Array, selections: Array) -> tuple[Array, Array]:
         values, gradients = np.empty(len(actions)), np.empty(actions.shape)
@@ -59,12 +61,10 @@ class _BoundInterpreted(BoundKernel):
             values[p], gradients[p] = self._at(actions[p], selections[p])
         return values, gradients
 
-    def climb(
-        self, start: Array, selection: Array, low: Array, high: Array, iterations: int, tolerance: float
-    ) -> Ended:
+    def climb(self, start: Array, selection: Array, iterations: int, tolerance: float) -> Ended:
         from scipy.optimize import Bounds, minimize
 
-        span = high - low
+        low, span = self._low, self._high - self._low
         best = Ended(start, -np.inf, "not finite", np.array([-np.inf]))
         history: list[float] = []
 
@@ -88,10 +88,8 @@ class _BoundInterpreted(BoundKernel):
             outcome = {0: "converged", 1: "iteration limit"}.get(int(found.status), "stalled")  # type: ignore[assignment]
         return Ended(best.point, best.value, outcome, np.array(history))
 
-    def ascend(
-        self, start: Array, selection: Array, low: Array, high: Array, limit: int, steps: AdadeltaSteps
-    ) -> Ended:
-        x = start.copy()
+    def ascend(self, start: Array, selection: Array, limit: int, steps: AdadeltaSteps) -> Ended:
+        x, low, high = start.copy(), self._low, self._high
         span = high - low if steps.scaled else np.ones_like(low)
         value, gradient = self._at(x, selection)
         if not (np.isfinite(value) and np.isfinite(gradient).all()):

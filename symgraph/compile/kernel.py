@@ -47,10 +47,7 @@ class Ended:
 
 
 class BoundKernel(ABC):
-    """A kernel with all inputs but actions and selections in place.
-
-    Bounds are (n,) arrays; an action with low = high is held there.
-    """
+    """A kernel with bounds and all inputs but actions and selections in place; of one thread at a time."""
 
     @abstractmethod
     def evaluate(self, actions: Array, selections: Array) -> tuple[Array, Array]:
@@ -65,24 +62,18 @@ class BoundKernel(ABC):
         """
 
     @abstractmethod
-    def climb(
-        self, start: Array, selection: Array, low: Array, high: Array, iterations: int, tolerance: float
-    ) -> Ended:
+    def climb(self, start: Array, selection: Array, iterations: int, tolerance: float) -> Ended:
         """Climb from one point to a local maximum within the bounds by L-BFGS.
 
         Args:
             start: (n,) actions.
             selection: (m,) one-hot.
-            low: (n,) lower bounds.
-            high: (n,) upper bounds.
             iterations: gradients at most.
             tolerance: largest element of the projected gradient over (x − low)/(high − low), relative to 1 + |J|.
         """
 
     @abstractmethod
-    def ascend(
-        self, start: Array, selection: Array, low: Array, high: Array, limit: int, steps: AdadeltaSteps
-    ) -> Ended:
+    def ascend(self, start: Array, selection: Array, limit: int, steps: AdadeltaSteps) -> Ended:
         """Move one point by ADADELTA for at most `limit` steps.
 
         On gradient g:  v ← ρv + (1 − ρ)g²,  Δ = g √(w + ε)/√(v + ε),  w ← ρw + (1 − ρ)Δ²,  x ← clip(x + Δ).
@@ -95,8 +86,14 @@ class Kernel(ABC):
     """Value (1, 1) and gradient (n, 1) as a function of actions (n, 1), selections (m, 1) and further columns."""
 
     @abstractmethod
-    def bind(self, shared: Sequence[Array]) -> BoundKernel:
-        """Put in the inputs after actions and selections, each flat in column-major order."""
+    def bind(self, shared: Sequence[Array], low: Array, high: Array) -> BoundKernel:
+        """Put in what a search does not change.
+
+        Args:
+            shared: the inputs after actions and selections, each flat in column-major order.
+            low: (n,) lower bounds of the actions.
+            high: (n,) upper bounds; an action with low = high is held there.
+        """
 
 
 def make_kernel(function: ca.Function, compiled: bool) -> Kernel:

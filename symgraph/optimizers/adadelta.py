@@ -211,11 +211,9 @@ class _Queue:
         return Run(point, point, best.choices, -np.inf, "iteration limit", np.zeros(0))
 
 
-def _move(
-    kernel: BoundKernel, box: tuple[Array, Array], points: Array, hot: Array, limit: int, steps: AdadeltaSteps
-) -> list[Ended]:
+def _move(kernel: BoundKernel, points: Array, hot: Array, limit: int, steps: AdadeltaSteps) -> list[Ended]:
     """Move points (P, n) one after the other; at the top level so that worker processes find it."""
-    return [kernel.ascend(point, one_hot, *box, limit, steps) for point, one_hot in zip(points, hot, strict=True)]
+    return [kernel.ascend(point, one_hot, limit, steps) for point, one_hot in zip(points, hot, strict=True)]
 
 
 @contextmanager
@@ -242,7 +240,7 @@ def _movers(processes: int) -> Iterator[Callable[[Adadelta, Problem, list[Run], 
 
 def _task(settings: Adadelta, problem: Problem, batch: list[Run], limit: int) -> tuple[Any, ...]:
     points, choices = np.array([run.point for run in batch]), np.array([run.choices for run in batch])
-    return problem.kernel, (problem.low, problem.high), points, problem.one_hot(choices), limit, settings._steps
+    return problem.kernel, points, problem.one_hot(choices), limit, settings._steps
 
 
 def _joined(batch: list[Run], ended: list[Ended]) -> list[Run]:

@@ -52,7 +52,7 @@ def climbed(problem: Problem, points: Array, choices: Choices, iterations: int, 
     runs: list[Run] = []
     try:
         for p in range(len(points)):
-            ended = problem.kernel.climb(points[p], hot[p], problem.low, problem.high, iterations, tolerance)
+            ended = problem.kernel.climb(points[p], hot[p], iterations, tolerance)
             runs.append(Run.of(points[p], choices[p], ended))
             problem.progress.update(p + 1, len(points))
     except KeyboardInterrupt:
@@ -80,9 +80,9 @@ def _peaks(unit: Array, values: Array, count: int) -> list[int]:
     """Return the indices of the best sample and of those in the better half that lie farthest from any better one."""
     order = np.argsort(-values, kind="stable")[: max(count, (len(values) + 1) // 2)]
     distances = np.linalg.norm(unit[order][:, None] - unit[order][None], axis=2)
-    to_better = [np.inf] + [distances[i, :i].min() for i in range(1, len(order))]
-    ranked = sorted(range(len(order)), key=lambda i: -to_better[i])
-    return [int(order[i]) for i in ranked[:count]]
+    better = np.tri(len(order), k=-1, dtype=bool)  # [i, j]: j is better than i
+    to_better = np.where(better, distances, np.inf).min(axis=1)
+    return [int(i) for i in order[np.argsort(-to_better, kind="stable")[:count]]]
 
 
 def positive_whole(name: str, value: object, owner: str) -> None:
