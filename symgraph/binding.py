@@ -56,6 +56,12 @@ class BoundModel:
         n = len(self.writes)
         return {label: Gaussian(results[i], results[n + i]) for i, label in enumerate(self.writes)}
 
+    def spread(self, uncertain: frozenset[str]) -> set[str]:
+        """Return which of the written labels are uncertain when those given are."""
+        function = self._built_for(tuple(label for label in self.reads if label in uncertain))
+        n = len(self.writes)
+        return {label for i, label in enumerate(self.writes) if function.nnz_out(n + i)}
+
     def moments(self, inputs: Mapping[str, Gaussian]) -> tuple[ca.Function, tuple[str, ...]]:
         """Return the function from input moments to output moments, and the labels that are uncertain in it.
 
@@ -63,10 +69,13 @@ class BoundModel:
         are the means of all writes and then their covariances.
         """
         uncertain = tuple(label for label in self.reads if inputs[label].covariance.nnz())
+        return self._built_for(uncertain), uncertain
+
+    def _built_for(self, uncertain: tuple[str, ...]) -> ca.Function:
         if uncertain not in self._built:
             build = self._build_propagator if is_propagator(self._function) else self._build_function
             self._built[uncertain] = build(uncertain)
-        return self._built[uncertain], uncertain
+        return self._built[uncertain]
 
     def _build_function(self, uncertain: tuple[str, ...]) -> ca.Function:
         # SX evaluates scalar by scalar and is far faster; MX serves functions that call what SX cannot hold.

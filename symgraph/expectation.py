@@ -5,6 +5,9 @@ the gradient is CasADi's derivative of that expression, so it contains equation 
 
 A choice becomes a CasADi switch over one function per branch: only the selected branch is evaluated, in the value and
 in every derivative. A product with a one-hot factor would evaluate them all, and 0 · NaN would poison the sum.
+
+Large trees are cut into such functions too. Subtrees of the same structure share one, so that a tree's code grows with
+the number of its different subtrees.
 """
 
 from __future__ import annotations
@@ -13,13 +16,15 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import accumulate
+from typing import Any
 
 import casadi as ca
 
 from symgraph.binding import REWARD, BoundModel
 from symgraph.model import Parameter
-from symgraph.slots import Gaussian
-from symgraph.tree import Tree, TreeGroup
+from symgraph.slots import Gaussian, State
+from symgraph.structure import Structure, is_open
+from symgraph.tree import Tree, TreeBranch, TreeGroup
 
 # Scalar instructions up to which an expression is flattened: flat code runs several times faster, but the C compiler's
 # time grows faster than its length.
@@ -116,104 +121,144 @@ class _Writer:
     def __init__(self, tree: Tree, inputs: Inputs) -> None:
         self._tree = tree
         self._inputs = inputs
-        self._dictionaries: dict[int, Dictionary] = {0: inputs.root}
-        # What each branch is worth before its child's value is known, by (node, group, branch).
-        self._probabilities: dict[tuple[int, int, int], ca.MX | float] = {}
-        self._rewards: dict[tuple[int, int], ca.MX] = {}
-        # At a choice the dictionary is handed into functions: local symbols and the expressions they stand for.
-        self._handed: dict[tuple[int, int], tuple[list[ca.MX], list[ca.MX]]] = {}
-        self._instructions = [0.0] * len(tree.nodes)
+        self._structure = Structure(tree)
+        self._functions: dict[tuple[Any, ...], ca.Function] = {}
 
     def run(self) -> Expectation:
-        for node in self._tree.nodes:
-            here = self._dictionaries.pop(node.index)
-            for g, tree_group in enumerate(node.groups):
-                self._forward(node.index, g, tree_group, here)
-        values: dict[int, ca.MX] = {}
+        # Functions are written before those that call them: leaves first. For that, a first pass finds what is
+        # uncertain where, without any calculus.
+        uncertain = self._uncertain_labels()
         for node in reversed(self._tree.nodes):
-            value = ca.MX(self._tree.cut_value if node.cut else 0.0)
-            for g, tree_group in enumerate(node.groups):
-                value = value + self._backward(node.index, g, tree_group, values)
-            values[node.index] = value
-        return Expectation(self._inputs, ca.densify(values[0]), self._instructions[0] <= FLATTEN_LIMIT)
+            for group in node.groups:
+                for branch in group.branches:
+                    if branch.child is not None and self._structure.apart[branch.child]:
+                        self._write_function(branch, uncertain[node.index])
+        value, instructions = self._value(0, self._inputs.root)
+        return Expectation(self._inputs, ca.densify(value), instructions <= FLATTEN_LIMIT)
 
-    def _forward(self, node: int, g: int, tree_group: TreeGroup, here: Dictionary) -> None:
-        if is_open(tree_group):
-            here = self._hand_over(node, g, here)
-        model = tree_group.group.probability
-        shares = self._apply(node, model, here) if isinstance(model, BoundModel) else {}
-        for b, tree_branch in enumerate(tree_group.branches):
-            label = tree_branch.branch.label
-            share = shares[label].mean if label in shares else tree_branch.share
-            self._probabilities[node, g, b] = 1.0 if share is None else share
-            model = tree_branch.branch.model
-            # A branch's model counts to the child: where the group is a choice, both go into one function.
-            owner = node if tree_branch.child is None else tree_branch.child
-            written = self._apply(owner, model, here) if model is not None else {}
-            if tree_branch.child is None:
-                self._rewards[node, g] = written[REWARD].mean
-            else:
-                self._dictionaries[tree_branch.child] = {**here, **written}
+    def _uncertain_labels(self) -> list[frozenset[str]]:
+        found = [frozenset[str]()] * len(self._tree.nodes)
+        found[0] = frozenset(self._inputs.uncertain)
+        for node in self._tree.nodes:
+            here = found[node.index]
+            for group in node.groups:
+                for branch in group.branches:
+                    model = branch.branch.model
+                    if branch.child is not None:
+                        found[branch.child] = here if model is None else (here - set(model.writes)) | model.spread(here)
+        return found
 
-    def _apply(self, node: int, model: BoundModel, here: Dictionary) -> Dictionary:
-        function, _ = model.moments(here)
-        self._instructions[node] += function.n_instructions() if function.is_a("SXFunction") else math.inf
-        return model.apply(here)
+    def _write_function(self, branch: TreeBranch, uncertain: frozenset[str]) -> None:
+        """Write the value of a branch as a function of the dictionary at its source."""
+        key = self._key(branch, uncertain)
+        if key in self._functions:
+            return
+        slots = self._tree.graph.slots
+        here = {label: g for label, g in self._inputs.root.items() if not isinstance(slots[label], State)}
+        symbols: list[ca.MX] = []
+        for label in self._structure.needs(branch):
+            n = slots[label].size
+            mean = ca.MX.sym(label, n)
+            covariance = ca.MX.sym(label, n, n) if label in uncertain else None
+            here[label] = Gaussian(mean, covariance)
+            symbols += [mean] if covariance is None else [mean, covariance]
+        written, own = _apply(branch.branch.model, here)
+        value, instructions = self._value(branch.child or 0, {**here, **written})
+        name = f"branch_{len(self._functions)}"
+        function = ca.Function(name, symbols + self._shared_symbols, [ca.densify(value)], {"cse": True})
+        if own + instructions <= FLATTEN_LIMIT:
+            function = function.expand()
+        self._functions[key] = function
 
-    def _hand_over(self, node: int, g: int, here: Dictionary) -> Dictionary:
-        """Put symbols in the place of all that was computed since the root."""
-        local: Dictionary = {}
-        symbols, expressions = [], []
-        for label, gaussian in here.items():
-            if gaussian is self._inputs.root.get(label):
-                local[label] = gaussian
-                continue
-            mean = ca.MX.sym("mean", gaussian.mean.numel())
-            covariance = ca.MX.sym("covariance", gaussian.covariance.sparsity())
-            local[label] = Gaussian(mean, covariance)
-            symbols += [mean, covariance]
-            expressions += [gaussian.mean, gaussian.covariance]
-        self._handed[node, g] = symbols, expressions
-        return local
+    def _call(self, branch: TreeBranch, here: Dictionary) -> tuple[ca.Function, list[ca.MX]]:
+        """Return the function of a branch that stands apart, and the arguments it takes here."""
+        uncertain = frozenset(label for label, g in here.items() if g.covariance.nnz())
+        arguments: list[ca.MX] = []
+        for label in self._structure.needs(branch):
+            arguments.append(here[label].mean)
+            if label in uncertain:
+                arguments.append(here[label].covariance)
+        return self._functions[self._key(branch, uncertain)], arguments + self._shared_symbols
 
-    def _backward(self, node: int, g: int, tree_group: TreeGroup, values: dict[int, ca.MX]) -> ca.MX:
-        if is_open(tree_group):
-            return self._switch(node, g, tree_group, values)
-        total = ca.MX(0.0)
-        for b, tree_branch in enumerate(tree_group.branches):
-            if tree_branch.child is None:
-                total = total + self._rewards[node, g]
-            else:
-                self._instructions[node] += self._instructions[tree_branch.child] + 2
-                share = self._probabilities[node, g, b]
-                value = values.pop(tree_branch.child)
-                total = total + (value if isinstance(share, float) and share == 1.0 else share * value)
-        return total
+    def _key(self, branch: TreeBranch, uncertain: frozenset[str]) -> tuple[Any, ...]:
+        kind = self._structure.kinds[branch.child or 0]
+        return branch.branch.model, kind, uncertain.intersection(self._structure.needs(branch))
 
-    def _switch(self, node: int, g: int, tree_group: TreeGroup, values: dict[int, ca.MX]) -> ca.MX:
-        children = [branch.child for branch in tree_group.branches if branch.child is not None]
-        branch_values = [values.pop(child) for child in children]
-        used = ca.symvar(ca.vertcat(*branch_values))
-        cases = []
-        for child, value in zip(children, branch_values, strict=True):
-            case = ca.Function(f"case_{node}_{g}_{child}", used, [ca.densify(value)], {"cse": True})
-            if self._instructions[child] <= FLATTEN_LIMIT:
-                case = case.expand()
-            cases.append(case)
-        self._instructions[node] = math.inf
-        locals_, expressions = self._handed.pop((node, g))
-        stand_for = {symbol.__hash__(): expression for symbol, expression in zip(locals_, expressions, strict=True)}
-        arguments = [stand_for.get(symbol.__hash__(), symbol) for symbol in used]
-        selection = self._inputs.root[str(tree_group.group.selection)].mean
-        index = ca.dot(selection, ca.DM(range(selection.numel())))
-        order = {branch.branch.label: case for branch, case in zip(tree_group.branches, cases, strict=True)}
-        choices = self._tree.graph.selections()[str(tree_group.group.selection)].choices
-        if len(choices) == 1:
-            return cases[0].call(arguments)[0]
-        switch = ca.Function.conditional(f"choice_{node}_{g}", [order[c] for c in choices[:-1]], order[choices[-1]])
-        return switch.call([index, *arguments])[0]
+    @property
+    def _shared_symbols(self) -> list[ca.MX]:
+        inputs = self._inputs
+        return [inputs.actions, inputs.selections, *(parameter.symbol for parameter in inputs.parameters)]
+
+    def _value(self, root: int, dictionary: Dictionary) -> tuple[ca.MX, float]:
+        """Write the value of a subtree up to the branches that stand apart; also count scalar instructions."""
+        instructions = 0.0
+        dictionaries = {root: dictionary}
+        order = [root]  # grows while it is walked
+        terms: dict[int, list[tuple[ca.MX | float, ca.MX | int]]] = {}  # node → (probability, value or child)
+        for index in order:
+            here = dictionaries.pop(index)
+            terms[index] = []
+            for group in self._tree.nodes[index].groups:
+                if is_open(group):
+                    instructions = math.inf
+                    terms[index].append((1.0, self._switch(group, here)))
+                    continue
+                model = group.group.probability
+                shares, count = _apply(model if isinstance(model, BoundModel) else None, here)
+                instructions += count
+                for branch in group.branches:
+                    label = branch.branch.label
+                    share = shares[label].mean if label in shares else branch.share
+                    probability = 1.0 if share is None else share
+                    if branch.child is not None and self._structure.apart[branch.child]:
+                        instructions = math.inf
+                        function, arguments = self._call(branch, here)
+                        terms[index].append((probability, function.call(arguments)[0]))
+                        continue
+                    written, count = _apply(branch.branch.model, here)
+                    instructions += count + 2
+                    if branch.child is None:
+                        terms[index].append((probability, written[REWARD].mean))
+                    else:
+                        dictionaries[branch.child] = {**here, **written}
+                        order.append(branch.child)
+                        terms[index].append((probability, branch.child))
+        values: dict[int, ca.MX] = {}
+        for index in reversed(order):
+            total = ca.MX(self._tree.cut_value if self._tree.nodes[index].cut else 0.0)
+            for probability, term in terms[index]:
+                value = values.pop(term) if isinstance(term, int) else term
+                certain = isinstance(probability, float) and probability == 1.0
+                total = total + (value if certain else probability * value)
+            values[index] = total
+        return values[root], instructions
+
+    def _switch(self, group: TreeGroup, here: Dictionary) -> ca.MX:
+        """Write a choice: the function of the selected branch, the others not evaluated."""
+        slot = self._tree.graph.selections()[str(group.group.selection)]
+        calls = [self._call(branch, here) for branch in group.branches]  # in the order of the slot's choices
+        if len(calls) == 1:
+            return calls[0][0].call(calls[0][1])[0]
+        # All cases of a switch take the same arguments: those that any of them needs.
+        arguments = {argument.__hash__(): argument for _, given in calls for argument in given}
+        symbols = {key: ca.MX.sym("x", argument.sparsity()) for key, argument in arguments.items()}
+        cases = [
+            ca.Function(
+                f"case_{function.name()}",
+                list(symbols.values()),
+                function.call([symbols[argument.__hash__()] for argument in given]),
+            )
+            for function, given in calls
+        ]
+        selection = self._inputs.root[str(group.group.selection)].mean
+        index = ca.dot(selection, ca.DM(range(slot.size)))
+        switch = ca.Function.conditional("choice", cases[:-1], cases[-1])
+        return switch.call([index, *arguments.values()])[0]
 
 
-def is_open(tree_group: TreeGroup) -> bool:
-    """Whether the group is a choice that no choice further up has decided."""
-    return tree_group.group.kind == "choose" and all(branch.share is None for branch in tree_group.branches)
+def _apply(model: BoundModel | None, here: Dictionary) -> tuple[Dictionary, float]:
+    """Return what a model writes, and its scalar instructions: infinitely many where it cannot be flattened."""
+    if model is None:
+        return {}, 0.0
+    function, _ = model.moments(here)
+    return model.apply(here), function.n_instructions() if function.is_a("SXFunction") else math.inf
