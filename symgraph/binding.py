@@ -147,7 +147,7 @@ def bind(model: Any, slots: Mapping[str, Slot], role: str, place: str, branches:
     for name in own_names:
         label = model.rename.get(name, name)
         if label not in slots:
-            raise GraphError(f"{place} reads {label!r}{did_you_mean(label, slots)}. Slots: {names(slots)}")
+            raise GraphError(f"{place} reads {label!r}{did_you_mean(label, slots)} Slots: {names(slots)}")
         reads[name] = label
 
     sizes = _written_sizes(model.function, reads, slots, role, place)
@@ -156,7 +156,7 @@ def bind(model: Any, slots: Mapping[str, Slot], role: str, place: str, branches:
     if unused:
         known = [*reads, *sizes]
         raise GraphError(
-            f"{place}: rename names {unused[0]!r}, which it neither reads nor writes{did_you_mean(unused[0], known)}."
+            f"{place}: rename names {unused[0]!r}, which it neither reads nor writes{did_you_mean(unused[0], known)}"
             f" Its names: {names(known)}"
         )
     noise = {}
@@ -174,7 +174,10 @@ def bind(model: Any, slots: Mapping[str, Slot], role: str, place: str, branches:
 
 def _reads(function: Any, place: str) -> list[str]:
     if is_propagator(function):
-        return list(function.reads)
+        try:
+            return list(function.reads)
+        except TypeError:
+            raise GraphError(f"{place}: reads is {function.reads!r}; give labels, e.g. ('x', 'y')") from None
     try:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
@@ -183,7 +186,8 @@ def _reads(function: Any, place: str) -> list[str]:
         ) from None
     starred = [p for p in parameters if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
     if starred:
-        raise GraphError(f"{place} has the parameter '*{starred[0].name}'; name each slot that it reads")
+        stars = "*" if starred[0].kind is starred[0].VAR_POSITIONAL else "**"
+        raise GraphError(f"{place} has the parameter '{stars}{starred[0].name}'; name each slot that it reads")
     positional = [p for p in parameters if p.kind is p.POSITIONAL_ONLY and p.default is p.empty]
     if positional:
         raise GraphError(f"{place}: parameter {positional[0].name!r} is positional-only; slots are passed by name")
@@ -197,7 +201,11 @@ def _written_sizes(
     if is_propagator(function):
         x = {label: ca.MX.sym(label, slots[label].size) for label in reads.values()}
         sigma = {label: ca.MX.sym(label, s.size, s.size) for label, s in slots.items() if isinstance(s, State)}
-        moments = _call_propagator(function, reads, x, {label: sigma[label] for label in x if label in sigma}, place)
+        sigma = {label: sigma[label] for label in x if label in sigma}
+        moments = _call_propagator(function, reads, x, sigma, place)
+        parameters = [parameter.symbol for parameter in getattr(function, "parameters", ())]
+        results = [expression for g in moments.values() for expression in (g.mean, g.covariance)]
+        _check_symbols(results, [*x.values(), *sigma.values(), *parameters], place, "list it in `parameters`")
         return {name: gaussian.mean.numel() for name, gaussian in moments.items()}
 
     def call(kind: Any) -> tuple[Any, list[Any]]:
@@ -212,8 +220,9 @@ def _written_sizes(
         try:
             returned, inputs = call(ca.MX)
         except Exception:
+            said = str(error).strip().rstrip(".")
             raise GraphError(
-                f"{place} raised {type(error).__name__}: {error}. It is called once with CasADi columns named "
+                f"{place} raised {type(error).__name__}: {said}. It is called once with CasADi columns named "
                 f"{names(reads)}: use CasADi functions (casadi.sin, casadi.if_else) and no Python branches on values"
             ) from error
     if role == "reward":
@@ -236,12 +245,7 @@ def _written_sizes(
         if column.shape[1] != 1:
             shape = f"{column.shape[0]}×{column.shape[1]}"
             raise GraphError(f"{place} returned a {shape} matrix for {name!r}; return a column, e.g. transposed (.T)")
-        foreign = ca.Function("trace", inputs, [column], {"allow_free": True}).get_free()
-        if foreign:
-            raise GraphError(
-                f"{place} uses the symbol {foreign[0]}, which is none of its parameters; "
-                f"read it as a slot, or put a number in its place"
-            )
+        _check_symbols([column], inputs, place, "read it as a slot, or put a number in its place")
         sizes[str(name)] = int(column.numel())
     return sizes
 
@@ -268,7 +272,7 @@ def _writes(
     for name, size in sizes.items():
         label = model.rename.get(name, name)
         if label not in slots:
-            raise GraphError(f"{place} writes {label!r}{did_you_mean(label, slots)}. Slots: {names(slots)}")
+            raise GraphError(f"{place} writes {label!r}{did_you_mean(label, slots)} Slots: {names(slots)}")
         slot = slots[label]
         if not isinstance(slot, State):
             raise GraphError(f"{place} writes {label!r}, which is {_article(slot)}; models write states only")
@@ -278,6 +282,12 @@ def _writes(
             raise GraphError(f"{place} writes {label!r} twice; change rename")
         writes[name] = (label, size)
     return writes
+
+
+def _check_symbols(results: list[Any], inputs: list[Any], place: str, remedy: str) -> None:
+    foreign = ca.Function("trace", inputs, results, {"allow_free": True}).get_free()
+    if foreign:
+        raise GraphError(f"{place} uses the symbol {foreign[0]}, which is none of its inputs; {remedy}")
 
 
 def _call_propagator(
@@ -297,6 +307,8 @@ def _call_propagator(
         raise GraphError(f"{place}: propagate returned {names(returned)}, its writes are {names(function.writes)}")
     symbolic = {}
     for name, g in returned.items():
+        if isinstance(g.mean, ca.SX) or isinstance(g.covariance, ca.SX):
+            raise GraphError(f"{place}: propagate returned SX for {name!r}; compute with the MX that it is given")
         mean = g.mean if isinstance(g.mean, ca.MX) else ca.MX(ca.DM(g.mean))
         covariance = g.covariance if isinstance(g.covariance, ca.MX) else ca.MX(ca.sparsify(ca.DM(g.covariance)))
         symbolic[name] = Gaussian(mean, covariance)

@@ -38,17 +38,18 @@ class MissingExtraError(SymgraphError, ImportError):
 
 
 def names(labels: Iterable[str]) -> str:
-    """List labels for a message: 'a', 'b', 'c'."""
-    return ", ".join(repr(label) for label in labels) or "(none)"
+    """List labels for a message, each once: 'a', 'b', 'c'."""
+    return ", ".join(repr(label) for label in dict.fromkeys(labels)) or "(none)"
 
 
-def did_you_mean(name: str, options: Iterable[str]) -> str:
-    """Return "; did you mean 'x'?" for the option closest to a misspelt name, or ''."""
+def did_you_mean(name: object, options: Iterable[str]) -> str:
+    """End a message's first sentence: "; did you mean 'x'?" for the option closest to a misspelt name, or "."."""
 
     def likeness(option: str) -> float:
         # A label such as lower_muzzle is also meant by a misspelling of one of its words.
         words = [option, *option.split("_")]
-        return max(difflib.SequenceMatcher(None, str(name).lower(), w.lower()).ratio() for w in words if w)
+        given = str(name).lower()
+        return max(difflib.SequenceMatcher(None, given, word.lower()).ratio() for word in words if word)
 
     ranked = sorted(((likeness(option), -i, option) for i, option in enumerate(options) if option), reverse=True)
-    return f"; did you mean {ranked[0][2]!r}?" if ranked and ranked[0][0] > 0.6 else ""
+    return f"; did you mean {ranked[0][2]!r}?" if ranked and ranked[0][0] > 0.6 else "."

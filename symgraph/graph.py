@@ -10,6 +10,7 @@ from typing import Any, Literal
 from symgraph.binding import BoundModel, bind
 from symgraph.drawing import Diagram, DiagramEdge, DiagramNode, NodeKind
 from symgraph.errors import GraphError, did_you_mean, names
+from symgraph.model import Model, Propagator
 from symgraph.slots import Action, Selection, Slot, State
 
 Kind = Literal["edge", "choose", "chance", "reward"]
@@ -49,6 +50,8 @@ class Graph:
     """
 
     def __init__(self, slots: Mapping[str, Slot], start: str) -> None:
+        if not isinstance(slots, Mapping):
+            raise GraphError(f"slots is {slots!r}; give {{label: State, Action or Selection}}")
         for label, slot in slots.items():
             if not isinstance(label, str) or not label:
                 raise GraphError(f"slot label {label!r} is not a name; labels are non-empty strings")
@@ -74,10 +77,10 @@ class Graph:
         """
         source = _node(source, "source")
         place = f"node {source!r}"
-        slot = self.slots.get(selection)
+        slot = self.slots.get(selection) if isinstance(selection, str) else None
         if slot is None:
             raise GraphError(
-                f"{place}: selection {selection!r} is not a slot{did_you_mean(selection, self._labels(Selection))}."
+                f"{place}: selection {selection!r} is not a slot{did_you_mean(selection, self._labels(Selection))}"
                 f" Selections: {names(self._labels(Selection))}"
             )
         if not isinstance(slot, Selection):
@@ -86,7 +89,7 @@ class Graph:
         unknown = [choice for choice in choices if choice not in slot.choices]
         if unknown:
             raise GraphError(
-                f"{place}: {unknown[0]!r} is not a choice of {selection!r}{did_you_mean(unknown[0], slot.choices)}."
+                f"{place}: {unknown[0]!r} is not a choice of {selection!r}{did_you_mean(unknown[0], slot.choices)}"
                 f" Choices: {names(slot.choices)}"
             )
         missing = [choice for choice in slot.choices if choice not in choices]
@@ -115,6 +118,8 @@ class Graph:
             raise GraphError(f"{place}: chance has no branches; give at least one")
         if isinstance(probability, Mapping):
             p: Any = _constant_probabilities(probability, branches, place)
+        elif not callable(probability) and not isinstance(probability, (Model, Propagator)):
+            raise GraphError(f"{place}: probability = {probability!r}; give {{branch: number}} or a model")
         else:
             p = bind(probability, self.slots, "probability", f"{place}, probability", branches)
         bound = [Branch(b, t, self._bind(m, f"{place}, branch {b!r}")) for b, (t, m) in branches.items()]
@@ -155,7 +160,7 @@ class Graph:
         lost = [node for node in self.nodes if node not in reached]
         if lost:
             raise GraphError(
-                f"node {lost[0]!r} cannot be reached from the start {self.start!r}{did_you_mean(lost[0], reached)}."
+                f"node {lost[0]!r} cannot be reached from the start {self.start!r}{did_you_mean(lost[0], reached)}"
                 f" Reached: {names(node for node in self.nodes if node in reached)}"
             )
 
@@ -232,7 +237,7 @@ def _constant_probabilities(given: Mapping[str, Any], branches: Mapping[str, Any
     unknown = [label for label in given if label not in branches]
     if unknown:
         raise GraphError(
-            f"{place}: probability names {unknown[0]!r}, which is no branch{did_you_mean(str(unknown[0]), branches)}."
+            f"{place}: probability names {unknown[0]!r}, which is no branch{did_you_mean(unknown[0], branches)}"
             f" Branches: {names(branches)}"
         )
     missing = [label for label in branches if label not in given]

@@ -197,7 +197,7 @@ def _dot(
             exits[box].append(place)
     lines = [
         "digraph {",
-        "rankdir=TB; nodesep=0.3; ranksep=0.3;" if down else "rankdir=LR; nodesep=0.15; ranksep=0.4;",
+        "rankdir=TB; nodesep=0.3; ranksep=0.36;" if down else "rankdir=LR; nodesep=0.15; ranksep=0.4;",
         f'node [shape=box, label="", margin=0, is=box]; edge [arrowsize={HEAD / 10}, part=0, dir=forward];',
     ]
     if forest:

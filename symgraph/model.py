@@ -10,7 +10,7 @@ import numpy as np
 
 from symgraph.errors import GraphError, SlotError, did_you_mean, names
 from symgraph.propagation import RULES
-from symgraph.slots import Array, Gaussian
+from symgraph.slots import Array, Gaussian, as_numbers
 
 
 @runtime_checkable
@@ -41,9 +41,7 @@ class Parameter:
 
     def __init__(self, value: Any, name: str = "parameter") -> None:
         self.name = name
-        self._value = np.atleast_2d(np.array(value, dtype=float))
-        if np.ndim(value) == 1:
-            self._value = self._value.T
+        self._value = self._checked(value)
         self.symbol = ca.MX.sym(name, *self._value.shape)
 
     @property
@@ -52,12 +50,18 @@ class Parameter:
 
     @value.setter
     def value(self, value: Any) -> None:
-        new = np.array(value, dtype=float)
-        if new.size != self._value.size:
-            raise SlotError(f"parameter {self.name!r}: {new.size} numbers for {self._value.size}; the shape is fixed")
-        if not np.isfinite(new).all():
-            raise SlotError(f"parameter {self.name!r}: the new value is not finite")
-        self._value = new.reshape(self._value.shape)
+        new = self._checked(value)
+        if new.shape != self._value.shape:
+            raise SlotError(f"parameter {self.name!r}: shape {new.shape} for {self._value.shape}; the shape is fixed")
+        self._value = new
+
+    def _checked(self, value: Any) -> Array:
+        numbers = as_numbers(value, f"parameter {self.name!r}")
+        if numbers.ndim > 2:
+            raise SlotError(f"parameter {self.name!r} has shape {numbers.shape}; give a number, a column or a matrix")
+        if not np.isfinite(numbers).all():
+            raise SlotError(f"parameter {self.name!r}: the value is not finite")
+        return numbers.reshape(-1, 1) if numbers.ndim < 2 else numbers
 
 
 class Model:
@@ -84,18 +88,22 @@ class Model:
         noise: Mapping[str, Any] | None = None,
     ) -> None:
         self.function = function
+        self.name = _name(function)
+        examples = ("rename", rename, "{'muzzle': 'lower_muzzle'}"), ("noise", noise, "{'height': 0.01}")
+        for option, given, example in examples:
+            if given is not None and not isinstance(given, Mapping):
+                raise GraphError(f"model {self.name!r}: {option} = {given!r}; give a dict, e.g. {example}")
         self.rename = dict(rename or {})
         self.propagation = propagation
         self.noise = dict(noise or {})
-        self.name = _name(function)
         if isinstance(function, Model):
             raise GraphError(f"model {self.name!r} is wrapped in Model twice; give all options to one Model")
         if not is_propagator(function) and not callable(function):
             raise GraphError(f"{function!r} is not a model; give a function of slots, a Model or a network")
-        if propagation is not None and propagation not in RULES:
+        if propagation is not None and (not isinstance(propagation, str) or propagation not in RULES):
             raise GraphError(
                 f"model {self.name!r}: propagation = {propagation!r} is not a rule"
-                f"{did_you_mean(str(propagation), RULES)}. Rules: {names(RULES)}"
+                f"{did_you_mean(propagation, RULES)} Rules: {names(RULES)}"
             )
         if propagation is not None and is_propagator(function):
             raise GraphError(

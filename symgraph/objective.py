@@ -165,7 +165,10 @@ class Objective:
             values (P,) and gradients (n, P).
         """
         situation = self.situation(state)
-        columns = np.asarray(points, dtype=float)
+        try:
+            columns = np.asarray(points, dtype=float)
+        except (TypeError, ValueError):
+            raise InputError(f"points is {points!r}; give an array of numbers") from None
         n = self.n_actions
         if columns.ndim != 2 or columns.shape[0] != n:
             raise InputError(
@@ -210,9 +213,8 @@ class Objective:
         missing = {label: place for label, place in self.tree.needed_states.items() if label not in given}
         if missing:
             label, place = next(iter(missing.items()))
-            others = f" Missing in all: {names(missing)}." if len(missing) > 1 else ""
             hint = did_you_mean(label, [x for x in given if x not in self.tree.needed_states])
-            raise InputError(f"state {label!r} is missing: {place} reads it{hint}.{others}")
+            raise InputError(f"state {label!r} is missing: {place} reads it{hint} Missing in all: {names(missing)}")
         uncertain = frozenset(label for label in self.tree.needed_states if isinstance(state[label], Gaussian))
         if uncertain not in self._builds:
             self._builds[uncertain] = Build(self.tree, uncertain, self._compiled)
@@ -273,7 +275,7 @@ class Objective:
         slot = slots.get(label)
         if slot is None:
             raise InputError(
-                f"state {label!r} is not a slot{did_you_mean(label, slots)}. States: {names(self.graph.states())}"
+                f"state {label!r} is not a slot{did_you_mean(label, slots)} States: {names(self.graph.states())}"
             )
         if isinstance(slot, Action):
             raise InputError(
@@ -282,6 +284,8 @@ class Objective:
         if isinstance(slot, Selection):
             raise InputError(f"{label!r} is a selection, not a state: give it as selections= or fixed=")
         if isinstance(value, Gaussian):
+            if isinstance(value.mean, (ca.SX, ca.MX)):
+                raise InputError(f"state {label!r} is a Gaussian of symbols; give numbers")
             if np.size(value.mean) != slot.size:
                 raise InputError(f"state {label!r}: the mean has {np.size(value.mean)} elements, the slot {slot.size}")
             return value
@@ -294,7 +298,7 @@ class Objective:
         for label in given:
             if label not in slots:
                 raise InputError(
-                    f"{label!r} is no {kind}{did_you_mean(str(label), slots)}. {kind.capitalize()}s: {names(slots)}"
+                    f"{label!r} is no {kind}{did_you_mean(str(label), slots)} {kind.capitalize()}s: {names(slots)}"
                 )
 
 
@@ -311,9 +315,9 @@ def checked_column(value: Any, size: int, place: str) -> Array:
 
 def check_choice(label: str, choice: Any, slot: Selection) -> None:
     """Raise InputError when a choice is none of the selection's."""
-    if choice not in slot.choices:
-        hint = did_you_mean(str(choice), slot.choices)
-        raise InputError(f"selection {label!r}: {choice!r} is not a choice{hint}. Choices: {names(slot.choices)}")
+    if not isinstance(choice, str) or choice not in slot.choices:
+        hint = did_you_mean(choice, slot.choices)
+        raise InputError(f"selection {label!r}: {choice!r} is not a choice{hint} Choices: {names(slot.choices)}")
 
 
 def stacked_index(slots: Mapping[str, Slot]) -> dict[str, slice]:

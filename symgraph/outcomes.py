@@ -17,7 +17,7 @@ from symgraph.slots import Array, Gaussian, unchecked_gaussian
 from symgraph.tree import Tree
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class NodeOutcome:
     """The expected outcome at one visit of a node.
 

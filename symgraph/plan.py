@@ -17,7 +17,7 @@ from symgraph.slots import Gaussian
 SHOWN_NODES = 12  # nodes that a printed plan lists
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlanRun:
     """What became of one start point.
 
@@ -40,7 +40,7 @@ class PlanRun:
     history: tuple[float, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Plan:
     """The best actions and selections that were found.
 

@@ -59,6 +59,7 @@ def solve(
         if not situation.build.has_kernel:
             bar.wait("compiling")
         problem = _problem(objective, situation, guess, fixed or {}, bar)
+        bar.wait("planning")
         search = optimizer.run(problem, np.random.default_rng(seed))
     best = best_of(search.runs)
     if best is None:
@@ -95,6 +96,8 @@ def _problem(
     selections = objective.graph.selections()
     where = stacked_index(objective.graph.actions())
     allowed = {label: tuple(range(slot.size)) for label, slot in selections.items()}
+    if not isinstance(fixed, Mapping):
+        raise InputError(f"fixed is {fixed!r}; give {{label: value}}")
     for label, value in fixed.items():
         slot = _planned_slot(objective, label, "fixed")
         if isinstance(slot, Action):
@@ -151,8 +154,8 @@ def _planned_slot(objective: Objective, label: str, place: str) -> Action | Sele
         raise InputError(
             f"{place}: {label!r} is a state; give it in the state. Actions and selections: {names(planned)}"
         )
-    hint = did_you_mean(str(label), planned)
-    raise InputError(f"{place}: {label!r} is no action or selection{hint}. Actions and selections: {names(planned)}")
+    hint = did_you_mean(label, planned)
+    raise InputError(f"{place}: {label!r} is no action or selection{hint} Actions and selections: {names(planned)}")
 
 
 def _selections(objective: Objective, run: Run) -> dict[str, str]:

@@ -156,7 +156,7 @@ def _element(objective: Objective, name: str) -> int:
     label, _, rest = name.partition("[")
     slots = objective.graph.actions()
     if label not in slots:
-        raise InputError(f"{label!r} is no action{did_you_mean(label, slots)}. Actions: {names(slots)}")
+        raise InputError(f"{label!r} is no action{did_you_mean(label, slots)} Actions: {names(slots)}")
     size = slots[label].size
     element = rest.rstrip("]") if rest else "0"
     if not element.isdigit() or int(element) >= size or (not rest and size > 1):

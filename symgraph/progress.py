@@ -42,10 +42,9 @@ class Progress:
             if self._bar is not None:
                 self._bar.stop()
 
-    def update(self, done: float, total: float, task: str | None = None) -> None:
+    def update(self, done: float, total: float) -> None:
         """Say how much is done; cheap enough for every iteration."""
         self._done, self._total = done, total
-        self._task = task or self._task
         if self._bar is not None:
             self._bar.update(self._row, completed=done, total=total, description=self._task)
         elif self._shown and time.monotonic() - self._begin > DELAY:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -76,10 +76,7 @@ class Action:
         given = getattr(self, side)
         if given is None:
             raise SlotError(f"Action: {side} is missing; an action needs finite bounds, e.g. Action(low=0.0, high=1.0)")
-        try:
-            bound = np.asarray(given, dtype=float).ravel()
-        except (TypeError, ValueError):
-            raise SlotError(f"Action: {side} = {given!r} is not a number or a sequence of numbers") from None
+        bound = as_numbers(given, f"Action: {side}").ravel()
         if bound.size not in (1, self.size):
             raise SlotError(f"Action: {side} has {bound.size} elements, size is {self.size}; give 1 or {self.size}")
         if not np.isfinite(bound).all():
@@ -103,6 +100,8 @@ class Selection:
     def __post_init__(self) -> None:
         if isinstance(self.choices, str):
             raise SlotError(f"Selection: choices = {self.choices!r} is one string; give a list, e.g. ['tip', 'shake']")
+        if not isinstance(self.choices, Iterable):
+            raise SlotError(f"Selection: choices = {self.choices!r}; give a list, e.g. ['tip', 'shake']")
         choices = tuple(self.choices)
         wrong = [choice for choice in choices if not isinstance(choice, str) or not choice]
         if wrong:
@@ -123,7 +122,7 @@ Slot = State | Action | Selection
 
 
 def _check_size(size: object, kind: str) -> None:
-    if isinstance(size, bool) or not isinstance(size, int) or size < 1:
+    if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 1:
         raise SlotError(f"{kind}: size = {size!r}; give a positive whole number")
 
 
@@ -161,7 +160,8 @@ class Gaussian:
         raise AttributeError(f"Gaussian is immutable; make a new one instead of setting {name!r}")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (Gaussian, (self.mean, self.covariance))
+        # Unchecked: what a plan computed may be NaN in a branch that is not selected.
+        return (unchecked_gaussian, (np.atleast_1d(self.mean), np.atleast_2d(self.covariance)))
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Gaussian):
@@ -185,21 +185,25 @@ class Gaussian:
 
 def _symbolic(mean: Any, covariance: Any, sd: Any) -> tuple[Any, Any]:
     kind = ca.SX if any(isinstance(x, ca.SX) for x in (mean, covariance, sd)) else ca.MX
-    mean = kind(mean)
+    try:
+        mean, covariance, sd = (None if x is None else kind(x) for x in (mean, covariance, sd))
+    except NotImplementedError:
+        raise SlotError("Gaussian: SX and MX, or symbols and other things, are mixed; give all as one kind") from None
     n = mean.numel()
     if mean.shape != (n, 1):
         raise SlotError(f"Gaussian: mean is {mean.shape[0]}×{mean.shape[1]}; give a column")
     if sd is not None:
-        deviations = kind(sd)
-        covariance = ca.diag(deviations if deviations.numel() == n else ca.repmat(deviations, n, 1)) ** 2
-    covariance = kind(n, n) if covariance is None else kind(covariance)
+        if sd.numel() not in (1, n):
+            raise SlotError(f"Gaussian: sd has {sd.numel()} elements, the mean {n}; give 1 or {n}")
+        covariance = ca.diag(sd if sd.numel() == n else ca.repmat(sd, n, 1)) ** 2
+    covariance = kind(n, n) if covariance is None else covariance
     if covariance.shape != (n, n):
         raise SlotError(f"Gaussian: covariance is {covariance.shape[0]}×{covariance.shape[1]}, the mean needs {n}×{n}")
     return mean, covariance
 
 
 def _numeric(mean: Any, covariance: Any, sd: Any) -> tuple[Any, Any]:
-    column = as_column(mean, "Gaussian: mean")
+    column = as_column(mean, "Gaussian: mean").copy()
     n = column.size
     if sd is not None:
         deviations = as_column(sd, "Gaussian: sd")
@@ -222,12 +226,20 @@ def unchecked_gaussian(mean: Array, covariance: Array) -> Gaussian:
     return gaussian
 
 
+def as_numbers(value: Any, place: str) -> Array:
+    """Turn a number, a sequence or an array into an array of floats; raise SlotError naming the place otherwise."""
+    try:
+        numbers = np.asarray(value)
+        if numbers.dtype.kind not in "buif":  # a string of digits is not a number
+            raise TypeError
+        return numbers.astype(float)
+    except (TypeError, ValueError):
+        raise SlotError(f"{place} = {value!r} is not a number or an array of numbers") from None
+
+
 def as_column(value: Any, place: str) -> Array:
     """Turn a number or a sequence into a finite (n,) array; raise SlotError naming the place otherwise."""
-    try:
-        column = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        raise SlotError(f"{place} = {value!r} is not a number or a sequence of numbers") from None
+    column = as_numbers(value, place)
     if column.ndim > 1 and column.size != max(column.shape):
         raise SlotError(f"{place} has shape {column.shape}; give a number or a 1-D array")
     if column.size == 0:
@@ -242,10 +254,7 @@ def as_covariance(value: Any, size: int, place: str) -> Array:
     """Turn a variance or a matrix into a checked (size, size) covariance; None is zero."""
     if value is None:
         return np.zeros((size, size))
-    try:
-        matrix = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        raise SlotError(f"{place}: covariance = {value!r} is not a number or a matrix of numbers") from None
+    matrix = as_numbers(value, f"{place}: covariance")
     if matrix.size == 1 and size == 1:
         matrix = matrix.reshape(1, 1)
     if matrix.shape != (size, size):

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+
 from symgraph.binding import BoundModel
 from symgraph.drawing import Diagram, DiagramEdge, DiagramNode, NodeKind
 from symgraph.errors import GraphError, did_you_mean, names
@@ -168,19 +170,21 @@ def unroll(graph: Graph, max_visits: int = 3, start: str | None = None, cut_valu
     Source: Yamaguchi & Atkeson, Humanoids 2016, section II-B; visits count per path instead of over the whole search,
         since siblings that share nodes would otherwise cut each other.
     """
-    if isinstance(max_visits, bool) or not isinstance(max_visits, int) or max_visits < 1:
+    if not isinstance(graph, Graph):
+        raise GraphError(f"unroll takes a Graph, got {type(graph).__name__}")
+    if isinstance(max_visits, bool) or not isinstance(max_visits, (int, np.integer)) or max_visits < 1:
         raise GraphError(f"max_visits = {max_visits!r}; give a whole number of at least 1")
-    if not isinstance(cut_value, (int, float)) or not math.isfinite(cut_value):
+    if not isinstance(cut_value, (int, float, np.number)) or not math.isfinite(cut_value):
         raise GraphError(f"cut_value = {cut_value!r}; give a finite number")
     known = [node for node in graph.nodes if node != graph.start or _mentioned(graph, node)]
     for name in dict.fromkeys((graph.start, graph.start if start is None else start)):
         if name not in known:
             raise GraphError(
-                f"start node {name!r} is in no edge, choose, chance or reward{did_you_mean(name, known)}."
+                f"start node {name!r} is in no edge, choose, chance or reward{did_you_mean(name, known)}"
                 f" Nodes: {names(known)}"
             )
     graph.check_reachable()
-    return _Unroller(graph, max_visits, float(cut_value)).run(graph.start if start is None else start)
+    return _Unroller(graph, int(max_visits), float(cut_value)).run(graph.start if start is None else start)
 
 
 def _mentioned(graph: Graph, node: str) -> bool:

@@ -42,30 +42,36 @@ def load(source: str, compiler: str) -> ctypes.CDLL:
     """Compile C source, or find it compiled, and load it.
 
     Raises:
-        CompileError: with what the compiler said.
+        CompileError: the compiler, the disk or the loader refused.
     """
-    folder = _private_folder()
-    key = hashlib.sha256("\0".join([source, *_identity(compiler), *FLAGS]).encode()).hexdigest()[:32]
-    path = folder / f"{key}.so"
-    if path.exists():
-        try:
-            return ctypes.CDLL(str(path))
-        except OSError:  # cut short by a full disk or a crash: make it anew
-            path.unlink(missing_ok=True)
-    _compile(source, compiler, path)
-    return ctypes.CDLL(str(path))
+    try:
+        folder = _private_folder()
+        key = hashlib.sha256("\0".join([source, *_identity(compiler), *FLAGS]).encode()).hexdigest()[:32]
+        for path in folder.glob(f"{key}-*.so"):
+            if path.name == _name(key, path):
+                return ctypes.CDLL(str(path))
+            path.unlink(missing_ok=True)  # cut short by a crash or a full disk: make it anew
+        return ctypes.CDLL(str(_compile(source, compiler, folder, key)))
+    except OSError as error:
+        raise CompileError(f"compiling with {compiler} failed: {error}") from error
 
 
-def _compile(source: str, compiler: str, path: Path) -> None:
+def _compile(source: str, compiler: str, cache_folder: Path, key: str) -> Path:
     # Compiled in a folder of its own and moved into place at once, so that processes may race for it.
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+    with tempfile.TemporaryDirectory(dir=cache_folder) as folder:
         source_file, made = Path(folder, "kernel.c"), Path(folder, "kernel.so")
         source_file.write_text(source)
         command = [compiler, "-shared", *FLAGS, str(source_file), "-o", str(made), "-lm"]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             raise CompileError(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")
-        made.replace(path)
+        ctypes.CDLL(str(made))  # what cannot be loaded must not stay in the cache
+        return made.replace(cache_folder / _name(key, made))
+
+
+def _name(key: str, path: Path) -> str:
+    """Name a library by its size too: loading one that is cut short kills the process."""
+    return f"{key}-{path.stat().st_size}.so"
 
 
 def _private_folder() -> Path:
@@ -82,9 +88,13 @@ def _private_folder() -> Path:
     return _process_folder()
 
 
-@cache
 def _process_folder() -> Path:
-    return Path(tempfile.mkdtemp(prefix="symgraph-"))
+    return Path(_temporary().name)
+
+
+@cache
+def _temporary() -> tempfile.TemporaryDirectory[str]:
+    return tempfile.TemporaryDirectory(prefix="symgraph-")  # goes when the process ends
 
 
 @cache

@@ -11,12 +11,13 @@ import numpy as np
 
 from symgraph.compile.kernel import AdadeltaSteps, BoundKernel, Ended
 from symgraph.errors import InputError
-from symgraph.optimizers.lbfgs import climbed, positive_whole
+from symgraph.optimizers.lbfgs import climbed, number, positive_whole
 from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
 from symgraph.slots import Array
 
 RUNS_PER_TASK = 4  # runs that a worker process is handed at once
 MAX_DEATHS = 2  # workers that may die before the search ends with what it has
+SMALLEST_EPSILON = 1e-300  # 0 would keep every point where it is
 POLISHED = 2  # best runs of each combination of selections that are polished
 POLISH_ITERATIONS = 200
 
@@ -102,12 +103,9 @@ class Adadelta(Optimizer):
         for name in ("total_iterations", "finished"):
             if getattr(self, name) is not None:
                 positive_whole(name, getattr(self, name), "Adadelta")
-        if not 0.0 < self.decay < 1.0:
-            raise InputError(f"Adadelta: decay = {self.decay!r}; give a number between 0 and 1")
-        if not self.epsilon > 0.0:
-            raise InputError(f"Adadelta: epsilon = {self.epsilon!r}; give a positive number")
-        if not self.tolerance >= 0.0:
-            raise InputError(f"Adadelta: tolerance = {self.tolerance!r}; give a number of at least 0")
+        number("decay", self.decay, "Adadelta", 0.0, 1.0)
+        number("epsilon", self.epsilon, "Adadelta", SMALLEST_EPSILON)
+        number("tolerance", self.tolerance, "Adadelta", 0.0)
         if self.sampling not in ("spread", "uniform", "gaussian"):
             raise InputError(f"Adadelta: sampling = {self.sampling!r}; give 'spread', 'uniform' or 'gaussian'")
 
@@ -160,8 +158,10 @@ class Adadelta(Optimizer):
             if np.isfinite(run.value) and len(group) < POLISHED:
                 group.append(run)
         chosen = [run for group in by_choice.values() for run in group]
-        points = np.array([run.point for run in chosen]).reshape(len(chosen), problem.n)
-        choices = np.array([run.choices for run in chosen]).reshape(len(chosen), len(problem.sizes))
+        if not chosen:
+            return [], False
+        points = np.array([run.point for run in chosen])
+        choices = np.array([run.choices for run in chosen])
         polished = climbed(problem, points, choices, POLISH_ITERATIONS, 1e-9)
         for before, after in zip(chosen, polished, strict=False):
             after.start = before.start

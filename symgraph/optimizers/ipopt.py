@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from symgraph.compile.kernel import Outcome
-from symgraph.optimizers.lbfgs import positive_whole, promising_points
+from symgraph.optimizers.lbfgs import number, positive_whole, promising_points
 from symgraph.optimizers.problem import Choices, Optimizer, Problem, Run, Search
 from symgraph.slots import Array
 
+SMALLEST_TOLERANCE = 1e-15  # IPOPT refuses 0
 _OUTCOMES: dict[str, Outcome] = {
     "Solve_Succeeded": "converged",
     "Solved_To_Acceptable_Level": "converged",
@@ -41,6 +42,7 @@ class Ipopt(Optimizer):
     def __post_init__(self) -> None:
         positive_whole("iterations", self.iterations, "Ipopt")
         positive_whole("samples", self.samples, "Ipopt")
+        number("tolerance", self.tolerance, "Ipopt", SMALLEST_TOLERANCE)
 
     def run(self, problem: Problem, rng: np.random.Generator) -> Search:
         if problem.guesses:
@@ -57,8 +59,10 @@ class Ipopt(Optimizer):
                 runs.append(self._from(problem, point, choice))
         except KeyboardInterrupt:
             return Search(runs, "", interrupted=True)
-        status = runs[0].outcome if len(runs) == 1 else f"best of {len(runs)} starts"
-        return Search(runs, status)
+        if len(runs) > 1:
+            return Search(runs, f"best of {len(runs)} starts")
+        ended = runs[0].outcome
+        return Search(runs, ended if ended == "converged" else f"not converged: {ended}")
 
     def _from(self, problem: Problem, point: Array, choice: Choices) -> Run:
         hot = problem.one_hot(choice[None])

@@ -36,6 +36,7 @@ class Lbfgs(Optimizer):
     def __post_init__(self) -> None:
         for name in ("starts", "samples", "iterations"):
             positive_whole(name, getattr(self, name), "Lbfgs")
+        number("tolerance", self.tolerance, "Lbfgs", 0.0)
 
     def run(self, problem: Problem, rng: np.random.Generator) -> Search:
         points, choices = promising_points(problem, rng, self.starts, self.samples)
@@ -83,6 +84,13 @@ def _peaks(unit: Array, values: Array, count: int) -> list[int]:
     better = np.tri(len(order), k=-1, dtype=bool)  # [i, j]: j is better than i
     to_better = np.where(better, distances, np.inf).min(axis=1)
     return [int(i) for i in order[np.argsort(-to_better, kind="stable")[:count]]]
+
+
+def number(name: str, value: object, owner: str, low: float, high: float = np.inf) -> None:
+    """Raise InputError unless the setting is a finite number of at least `low` and below `high`."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not low <= value < high:
+        limits = f"of at least {low:g}" if high == np.inf else f"in [{low:g}, {high:g})"
+        raise InputError(f"{owner}: {name} = {value!r}; give a number {limits}")
 
 
 def positive_whole(name: str, value: object, owner: str) -> None:
