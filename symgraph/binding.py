@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import math
 import re
+import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -52,7 +54,7 @@ class BoundModel:
         function, uncertain = self.moments(inputs)
         arguments = [inputs[label].mean for label in self.reads]
         arguments += [inputs[label].covariance for label in uncertain]
-        results = function.call(arguments + [parameter.symbol for parameter in self.parameters])
+        results = function.call([ca.MX(x) for x in arguments] + [p.symbol for p in self.parameters])
         n = len(self.writes)
         return {label: Gaussian(results[i], results[n + i]) for i, label in enumerate(self.writes)}
 
@@ -91,12 +93,15 @@ class BoundModel:
             covariance + kind(ca.DM(self._noise[label])) if label in self._noise else covariance
             for label, (_, covariance) in zip(self.writes, moments, strict=True)
         ]
-        results = ca.cse([m for m, _ in moments] + covariances)
+        results = [m for m, _ in moments] + covariances
+        results = ca.cse(results) if results else []
         return ca.Function(_identifier(self.name), [*x.values(), *sigma.values()], results)
 
     def _trace(self, kind: Any) -> tuple[dict[str, Any], dict[str, Any]]:
         x = {label: kind.sym(_identifier(label), self._sizes[label]) for label in self.reads}
-        returned = self._function(**{name: x[label] for name, label in self._reads.items()})  # type: ignore[operator]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # numpy's functions work on CasADi's columns
+            returned = self._function(**{name: x[label] for name, label in self._reads.items()})  # type: ignore[operator]
         if not isinstance(returned, Mapping):
             returned = {REWARD: returned}
         return x, {label: _column(returned[name], kind) for name, (label, _) in self._writes.items()}
@@ -210,11 +215,15 @@ def _written_sizes(
 
     def call(kind: Any) -> tuple[Any, list[Any]]:
         x = {label: kind.sym(_identifier(label), slots[label].size) for label in reads.values()}
-        return function(**{name: x[label] for name, label in reads.items()}), list(x.values())
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # numpy's functions work on CasADi's columns
+            return function(**{name: x[label] for name, label in reads.items()}), list(x.values())
 
     kind: Any = ca.SX
     try:
         returned, inputs = call(ca.SX)
+        if _holds_nan(returned):
+            call(ca.MX)  # math.sin and float() turn SX into NaN without a word, but refuse MX
     except Exception as error:
         kind = ca.MX
         try:
@@ -282,6 +291,18 @@ def _writes(
             raise GraphError(f"{place} writes {label!r} twice; change rename")
         writes[name] = (label, size)
     return writes
+
+
+def _holds_nan(returned: Any) -> bool:
+    """Whether NaN stands as a constant in what a model returned for SX."""
+    values = returned.values() if isinstance(returned, Mapping) else [returned]
+    try:
+        column = ca.vertcat(*[ca.vec(_column(value, ca.SX)) for value in values])
+    except Exception:  # not an expression: refused with a reason later
+        return False
+    function = ca.Function("trace", [], [column], {"allow_free": True})
+    constants = [k for k in range(function.n_instructions()) if function.instruction_id(k) == ca.OP_CONST]
+    return any(math.isnan(function.instruction_constant(k)) for k in constants)
 
 
 def _check_symbols(results: list[Any], inputs: list[Any], place: str, remedy: str) -> None:

@@ -179,8 +179,11 @@ class Graph:
                         nodes.append(
                             DiagramNode(key=target, lines=(branch.model.name if branch.model else "",), kind="reward")
                         )
+                    weight = None
+                    if isinstance(group.probability, tuple):
+                        weight = group.probability[group.branches.index(branch)]
                     label = edge_label(group, branch)
-                    edges.append(DiagramEdge(source=name, target=target, label=label, group=g, kind=group.kind))
+                    edges.append(DiagramEdge(name, target, label, g, group.kind, weight=weight))
         return Diagram(nodes=tuple(nodes), edges=tuple(edges))
 
     def _repr_svg_(self) -> str:
@@ -220,9 +223,6 @@ def edge_label(group: Group, branch: Branch) -> str:
     if group.kind == "reward":
         return ""
     head = f"{group.selection} = {branch.label}" if group.kind == "choose" else branch.label
-    if group.kind == "chance" and isinstance(group.probability, tuple):
-        share = group.probability[[b.label for b in group.branches].index(branch.label)]
-        head = f"{branch.label} ({share:g})"
     model = branch.model.name if branch.model is not None else ""
     return ": ".join(part for part in (head, model) if part)
 

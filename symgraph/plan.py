@@ -144,8 +144,9 @@ class Plan:
         for i, node in enumerate(self.nodes):
             if node.probability:
                 notes[i] = (f"p = {node.probability:.3g}", f"J = {node.value:.4g}")
-        reach = {i: float(p) for i, p in enumerate(self.nodes.probabilities)}
-        return self.nodes.tree.diagram(notes, reach)
+        reach = dict(enumerate(self.nodes.probabilities.tolist()))
+        shares = dict(enumerate(self.nodes.shares.tolist()))
+        return self.nodes.tree.diagram(notes, reach, shares)
 
     def _repr_svg_(self) -> str | None:
         return self.diagram().svg() if isinstance(self.nodes, NodeOutcomes) else None

@@ -101,47 +101,40 @@ class Tree:
         return tuple(found)
 
     def diagram(
-        self, notes: Mapping[int, tuple[str, ...]] | None = None, probability: Mapping[int, float] | None = None
+        self,
+        notes: Mapping[int, tuple[str, ...]] | None = None,
+        reach: Mapping[int, float] | None = None,
+        shares: Mapping[int, float] | None = None,
     ) -> Diagram:
         """Return the picture of the tree; `diagram().save("tree.svg")` writes it to a file.
 
         Args:
             notes: {node index: further lines in its box}.
-            probability: {node index: probability of the plan getting there}; nodes with 0 are drawn pale.
+            reach: {node index: probability of getting there}; what has probability 0 is drawn pale.
+            shares: {node index: probability of getting there from its parent}, shown where chance decides.
         """
-        notes, probability = notes or {}, probability or {}
+        notes, reach, shares = notes or {}, reach or {}, shares or {}
         nodes, edges = [], []
         for node in self.nodes:
             kind: NodeKind
             kind = "cut" if node.cut else "start" if node.parent is None else "node" if node.groups else "terminal"
-            pale = probability.get(node.index, 1.0) == 0.0
-            key = str(node.index)
+            pale = reach.get(node.index) == 0.0
+            key, path = str(node.index), self.path(node.index)
             lines = (node.name, *notes.get(node.index, ()))
-            nodes.append(DiagramNode(key=key, lines=lines, kind=kind, muted=pale, tooltip=self.path(node.index)))
-            for g, tree_group in enumerate(node.groups):
-                for tree_branch in tree_group.branches:
-                    label = edge_label(tree_group.group, tree_branch.branch)
-                    if tree_branch.child is None:
-                        model = tree_branch.branch.model
-                        target, muted, weight = f"{key} reward {g}", pale, None
-                        line = model.name if model is not None else ""
-                        nodes.append(DiagramNode(key=target, lines=(line,), kind="reward", muted=pale))
+            nodes.append(DiagramNode(key=key, lines=lines, kind=kind, muted=pale, tooltip=path))
+            for g, group in enumerate(node.groups):
+                for branch in group.branches:
+                    weight = None
+                    if branch.child is None:
+                        target, muted = f"{key} reward {g}", pale
+                        name = branch.branch.model.name if branch.branch.model is not None else ""
+                        nodes.append(DiagramNode(key=target, lines=(name,), kind="reward", muted=pale))
                     else:
-                        target = str(tree_branch.child)
-                        reach = probability.get(tree_branch.child)
-                        muted = reach == 0.0
-                        weight = reach if tree_group.group.kind == "chance" else None
-                    edges.append(
-                        DiagramEdge(
-                            source=key,
-                            target=target,
-                            label=label,
-                            group=g,
-                            kind=tree_group.group.kind,
-                            muted=muted,
-                            weight=weight,
-                        )
-                    )
+                        target, muted = str(branch.child), reach.get(branch.child) == 0.0
+                        if group.group.kind == "chance":
+                            weight = shares.get(branch.child, branch.share)
+                    label = edge_label(group.group, branch.branch)
+                    edges.append(DiagramEdge(key, target, label, g, group.group.kind, muted, weight))
         return Diagram(nodes=tuple(nodes), edges=tuple(edges))
 
     def _repr_svg_(self) -> str:
