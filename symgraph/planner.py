@@ -59,7 +59,7 @@ def solve(
         if not situation.build.has_kernel:
             bar.wait("compiling")
         problem = _problem(objective, situation, guess, fixed or {}, bar)
-        bar.wait("planning")
+        bar.begin("planning")
         search = optimizer.run(problem, np.random.default_rng(seed))
     best = best_of(search.runs)
     if best is None:

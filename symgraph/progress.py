@@ -50,12 +50,16 @@ class Progress:
         elif self._shown and time.monotonic() - self._begin > DELAY:
             self._show()
 
-    def wait(self, task: str) -> None:
-        """Announce work that cannot report how far it is, such as a compiler's."""
+    def begin(self, task: str) -> None:
+        """Announce work that will report how far it is."""
         self._task = task
         if self._bar is not None:
             self._bar.update(self._row, description=task)
-        elif self._shown and self._timer is None:
+
+    def wait(self, task: str) -> None:
+        """Announce work that cannot report how far it is, such as a compiler's; costs the start of a thread."""
+        self.begin(task)
+        if self._shown and self._timer is None and self._bar is None:
             self._timer = threading.Timer(DELAY, self._show)
             self._timer.daemon = True
             self._timer.start()

@@ -54,6 +54,7 @@ class Ipopt(Optimizer):
             best = int(np.argmax(problem.values(points, choices)))
             points, choices = points[best : best + 1], choices[best : best + 1]
         runs: list[Run] = []
+        problem.progress.wait("planning")
         try:
             for point, choice in zip(points, choices, strict=True):
                 runs.append(self._from(problem, point, choice))
