@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,6 +18,7 @@ class FlatFunction:
 
     def __init__(self, function: ca.Function) -> None:
         self._function = function
+        self._lock = threading.Lock()
         buffer: Any
         buffer, self._evaluate = function.buffer()
         self._buffer = buffer  # kept alive: it owns what evaluate reads
@@ -29,10 +31,11 @@ class FlatFunction:
 
     def __call__(self, columns: Sequence[Array]) -> list[Array]:
         """Return the results, each flat in column-major order."""
-        for kept, column in zip(self._inputs, columns, strict=True):
-            kept[:] = column
-        self._evaluate()
-        return [column.copy() for column in self._outputs]
+        with self._lock:  # the buffers are one set for all threads
+            for kept, column in zip(self._inputs, columns, strict=True):
+                kept[:] = column
+            self._evaluate()
+            return [column.copy() for column in self._outputs]
 
     def __reduce__(self) -> tuple[type[FlatFunction], tuple[ca.Function]]:
         return FlatFunction, (self._function,)

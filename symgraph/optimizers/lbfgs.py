@@ -10,6 +10,8 @@ from symgraph.errors import InputError
 from symgraph.optimizers.problem import Choices, Optimizer, Problem, Run, Search
 from symgraph.slots import Array
 
+MOST_SAMPLES = 1024  # of one combination of selections: all are compared with each other
+
 
 @dataclass(frozen=True)
 class Lbfgs(Optimizer):
@@ -21,7 +23,7 @@ class Lbfgs(Optimizer):
 
     Args:
         starts: points climbed from, shared evenly by the combinations of selections (at least one each).
-        samples: points evaluated per start.
+        samples: points evaluated per start, up to 1024 for a combination.
         iterations: gradient evaluations of one climb at most.
         tolerance: largest element of the projected gradient, per range and relative to 1 + |J|, that is converged.
 
@@ -65,7 +67,7 @@ def promising_points(problem: Problem, rng: np.random.Generator, starts: int, sa
     """Return start points (P, n) and their choices (P, s): the most promising of samples spread over the bounds."""
     each = max(1, starts // problem.combinations)
     groups = problem.draw_choices(rng, min(problem.combinations, starts), evenly=True)
-    count = max(2, each * samples) if problem.n else 1
+    count = max(each, min(each * samples, MOST_SAMPLES)) if problem.n else 1
     points = np.concatenate([problem.draw_points(rng, count, "spread") for _ in groups])
     choices = np.repeat(groups, count, axis=0)
     values = problem.values(points, choices)
@@ -80,7 +82,10 @@ def promising_points(problem: Problem, rng: np.random.Generator, starts: int, sa
 def _peaks(unit: Array, values: Array, count: int) -> list[int]:
     """Return the indices of the best sample and of those in the better half that lie farthest from any better one."""
     order = np.argsort(-values, kind="stable")[: max(count, (len(values) + 1) // 2)]
-    distances = np.linalg.norm(unit[order][:, None] - unit[order][None], axis=2)
+    if len(order) <= count:
+        return [int(i) for i in order]
+    squares = (unit[order] ** 2).sum(axis=1)
+    distances = squares[:, None] + squares[None] - 2.0 * unit[order] @ unit[order].T
     better = np.tri(len(order), k=-1, dtype=bool)  # [i, j]: j is better than i
     to_better = np.where(better, distances, np.inf).min(axis=1)
     return [int(i) for i in order[np.argsort(-to_better, kind="stable")[:count]]]
