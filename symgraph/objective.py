@@ -10,8 +10,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from symgraph.compile import make_kernel
 from symgraph.compile.interpreted import FlatFunction
-from symgraph.compile.kernel import Kernel, make_kernel
+from symgraph.compile.kernel import Kernel
 from symgraph.errors import InputError, SlotError, did_you_mean, names
 from symgraph.expectation import Expectation, expected_value
 from symgraph.outcomes import NodeOutcomes, Outcomes

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import casadi as ca
-
-from symgraph.compile.library import find_compiler
-from symgraph.errors import CompileError
 from symgraph.slots import Array
 
 Outcome = Literal["converged", "iteration limit", "oscillation", "stalled", "not finite", "worker died", "interrupted"]
@@ -94,17 +89,3 @@ class Kernel(ABC):
             low: (n,) lower bounds of the actions.
             high: (n,) upper bounds; an action with low = high is held there.
         """
-
-
-def make_kernel(function: ca.Function, compiled: bool) -> Kernel:
-    """Return the fastest kernel there is for a function: compiled if wanted and possible, else interpreted."""
-    from symgraph.compile.compiled import CompiledKernel
-    from symgraph.compile.interpreted import InterpretedKernel
-
-    compiler = find_compiler() if compiled else None
-    if compiler is not None:
-        try:
-            return CompiledKernel(function, compiler)
-        except CompileError as error:
-            warnings.warn(f"{error}\nplans are computed in CasADi's interpreter instead", stacklevel=2)
-    return InterpretedKernel(function)
