@@ -56,7 +56,8 @@ class BoundModel:
         arguments += [inputs[label].covariance for label in uncertain]
         results = function.call([ca.MX(x) for x in arguments] + [p.symbol for p in self.parameters])
         n = len(self.writes)
-        return {label: Gaussian(results[i], results[n + i]) for i, label in enumerate(self.writes)}
+        # Of a model that reads nothing CasADi returns numbers.
+        return {label: Gaussian(ca.MX(results[i]), ca.MX(results[n + i])) for i, label in enumerate(self.writes)}
 
     def spread(self, uncertain: frozenset[str]) -> set[str]:
         """Return which of the written labels are uncertain when those given are."""

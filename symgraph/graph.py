@@ -141,12 +141,15 @@ class Graph:
         return list(found)
 
     def selections(self) -> dict[str, Selection]:
+        """Return the slots that are selections, in their order."""
         return {label: slot for label, slot in self.slots.items() if isinstance(slot, Selection)}
 
     def actions(self) -> dict[str, Action]:
+        """Return the slots that are actions, in their order: the order of stacked actions."""
         return {label: slot for label, slot in self.slots.items() if isinstance(slot, Action)}
 
     def states(self) -> dict[str, State]:
+        """Return the slots that are states, in their order."""
         return {label: slot for label, slot in self.slots.items() if isinstance(slot, State)}
 
     def check_reachable(self) -> None:

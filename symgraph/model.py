@@ -26,7 +26,9 @@ class Propagator(Protocol):
     reads: Iterable[str]
     writes: Iterable[str]
 
-    def propagate(self, inputs: dict[str, Gaussian]) -> Mapping[str, Gaussian]: ...
+    def propagate(self, inputs: dict[str, Gaussian]) -> Mapping[str, Gaussian]:
+        """Return the Gaussians of what it writes, given those of what it reads."""
+        ...
 
 
 class Parameter:
@@ -45,7 +47,8 @@ class Parameter:
         self.symbol = ca.MX.sym(name, *self._value.shape)
 
     @property
-    def value(self) -> Array:  # the shape of its symbol
+    def value(self) -> Array:
+        """The numbers, in the shape of the symbol; set it to change them."""
         return self._value
 
     @value.setter

@@ -23,7 +23,8 @@ class PlanRun:
 
     Attributes:
         selections: {label: choice}, which a run keeps.
-        start, actions: {label: value} at the start and at the end [unit].
+        start: {label: value} of the actions at the start [unit].
+        actions: {label: value} at the end [unit].
         value: expected reward at the end; -inf where nothing finite was met.
         outcome: "converged", "iteration limit", "oscillation", "stalled" (no step gains any more), "not finite",
             "worker died" or "interrupted".
@@ -52,7 +53,8 @@ class Plan:
         notes: what makes the value less than it seems, e.g. paths that are cut.
         nodes: the outcome at every tree node, in tree order.
         runs: a row per start point.
-        optimizer, seed: how it was found.
+        optimizer: what found it.
+        seed: of all that was random.
         seconds: wall time of the search [s].
         units: {label: unit} of the actions and states that have one.
     """

@@ -65,11 +65,13 @@ class Action:
             )
 
     @property
-    def lower(self) -> Array:  # (size,)
+    def lower(self) -> Array:
+        """Lower bounds, one per element, (size,) [unit]."""
         return np.asarray(self.low, dtype=float)
 
     @property
-    def upper(self) -> Array:  # (size,)
+    def upper(self) -> Array:
+        """Upper bounds, one per element, (size,) [unit]."""
         return np.asarray(self.high, dtype=float)
 
     def _bound(self, side: str) -> tuple[float, ...]:
@@ -115,6 +117,7 @@ class Selection:
 
     @property
     def size(self) -> int:
+        """Number of choices: the length of the one-hot column."""
         return len(self.choices)
 
 
