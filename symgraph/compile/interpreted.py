@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
 
 from symgraph.compile.kernel import AdadeltaSteps, BoundKernel, Ended, Kernel, Outcome
 from symgraph.slots import Array
+
+# The search of search.c, step for step: its constants.
+FIRST_STEP = 0.05
+LONGEST_STEP = 0.5
+ARMIJO = 1e-4
+SMALLEST_GAIN = 1e-15
+MOST_PAIRS = 8
+MOST_BACKTRACKS = 40
 
 
 class FlatFunction:
@@ -65,31 +73,66 @@ class _BoundInterpreted(BoundKernel):
         return values, gradients
 
     def climb(self, start: Array, selection: Array, iterations: int, tolerance: float) -> Ended:
-        from scipy.optimize import Bounds, minimize
+        def descend(u: Array) -> tuple[float, Array, bool]:
+            value, gradient = self._at(self._low + span * u, selection)
+            gradient = -gradient * span
+            return -value, gradient, bool(np.isfinite(value) and np.isfinite(gradient).all())
 
-        low, span = self._low, self._high - self._low
-        best = Ended(start, -np.inf, "not finite", np.array([-np.inf]))
-        history: list[float] = []
-
-        def descend(u: Array) -> tuple[float, Array]:
-            value, gradient = self._at(low + span * u, selection)
-            if not (np.isfinite(value) and np.isfinite(gradient).all()):
-                return np.inf, np.zeros(len(u))  # L-BFGS-B backs off
-            if value > best.value:
-                best.point, best.value = low + span * u, value
-            history.append(best.value)
-            return -value, -gradient * span
-
-        u = np.clip((start - low) / np.where(span > 0.0, span, 1.0), 0.0, 1.0)
-        if not np.isfinite(descend(u)[0]):
-            return best
-        outcome: Outcome = "converged"
-        if (span > 0.0).any():
-            options: Any = {"maxfun": iterations, "maxiter": iterations, "ftol": 1e-15, "gtol": tolerance, "maxls": 40}
-            box = Bounds(np.zeros(len(u)), (span > 0.0).astype(float))
-            found = minimize(descend, u, jac=True, method="L-BFGS-B", bounds=box, options=options)
-            outcome = {0: "converged", 1: "iteration limit"}.get(int(found.status), "stalled")  # type: ignore[assignment]
-        return Ended(best.point, best.value, outcome, np.array(history))
+        span = self._high - self._low
+        u = np.clip((start - self._low) / np.where(span > 0.0, span, 1.0), 0.0, 1.0)
+        f, g, finite = descend(u)
+        if not finite:
+            return Ended(start, -np.inf, "not finite", np.array([-np.inf]))
+        pairs: list[tuple[Array, Array]] = []  # (step, gradient change), newest last
+        most = min(max(len(u), 1), MOST_PAIRS)
+        history, outcome = [-f], "iteration limit"
+        fresh, flat, backtracks, reach, t = True, 0, 0, FIRST_STEP, 1.0
+        d = np.zeros_like(u)
+        while True:
+            noise = SMALLEST_GAIN * abs(f)
+            if fresh:
+                free = ~((span <= 0.0) | ((u <= 0.0) & (g > 0.0)) | ((u >= 1.0) & (g < 0.0)))
+                slope = float(np.abs(g * free).max(initial=0.0))
+                if slope <= tolerance * (1.0 + abs(f)):
+                    outcome = "converged"
+                    break
+                d = _two_loop(pairs, g, free.astype(float))
+                if not pairs or not d @ g < 0.0:  # nothing known of the curvature: along the gradient
+                    d = -g * free * (reach / slope)
+                longest = float(np.abs(d).max())
+                if longest > LONGEST_STEP:
+                    d = d * (LONGEST_STEP / longest)
+                t, backtracks, fresh = 1.0, 0, False
+            if len(history) >= iterations:
+                break
+            trial = np.clip(u + t * d, 0.0, 1.0)
+            moved = trial - u
+            predicted = float(g @ moved)
+            f_trial, g_trial, finite = descend(trial)
+            if finite and f_trial <= f + ARMIJO * predicted + noise:
+                change = g_trial - g
+                if moved @ change > 1e-12 * np.sqrt((moved @ moved) * (change @ change)):
+                    pairs = [*pairs[1 - most :], (moved, change)] if most > 1 else [(moved, change)]
+                else:  # curved the wrong way: what was learnt does not help; on along the gradient with longer steps
+                    pairs, reach = [], float(np.clip(2.0 * np.sqrt(moved @ moved), 1e-12, LONGEST_STEP))
+                flat = flat + 1 if f - f_trial <= noise else 0
+                u, f, g, fresh = trial, f_trial, g_trial, True
+            else:
+                # The minimum of the parabola through f, its slope and the new value, within a tenth to a half.
+                rise = f_trial - f - predicted
+                t *= min(max(-predicted / (2.0 * rise) if finite and rise > 0.0 else 0.1, 0.1), 0.5)
+                backtracks += 1
+                if backtracks > MOST_BACKTRACKS or np.abs(moved).max() <= 1e-16:
+                    if not pairs:  # no step gains any more
+                        outcome = "stalled"
+                        history.append(-f)
+                        break
+                    pairs, reach, fresh = [], 1e-3, True  # if the pairs are to blame, the gradient alone still gains
+            history.append(-f)
+            if flat >= 2:
+                outcome = "converged"
+                break
+        return Ended(self._low + span * u, -f, cast(Outcome, outcome), np.array(history))
 
     def ascend(self, start: Array, selection: Array, limit: int, steps: AdadeltaSteps) -> Ended:
         x, low, high = start.copy(), self._low, self._high
@@ -102,7 +145,7 @@ class _BoundInterpreted(BoundKernel):
         history = [value]
         outcome: Outcome = "iteration limit"
         while len(history) <= limit:
-            before = value
+            before, last = value, x
             slope = gradient * span
             v = steps.decay * v + (1.0 - steps.decay) * slope * slope
             delta = slope * np.sqrt((w + steps.epsilon) / (v + steps.epsilon))
@@ -110,8 +153,8 @@ class _BoundInterpreted(BoundKernel):
             x = np.clip(x + delta * span, low, high)
             value, gradient = self._at(x, selection)
             if not (np.isfinite(value) and np.isfinite(gradient).all()):
-                value, outcome = -np.inf, "not finite"
-                history.append(value)
+                history.append(-np.inf)
+                x, value, outcome = last, before, "not finite"  # the last finite iterate counts
                 break
             history.append(value)
             if value > best_value:
@@ -129,3 +172,22 @@ class _BoundInterpreted(BoundKernel):
     def _at(self, actions: Array, selection: Array) -> tuple[float, Array]:
         value, gradient = self._function([actions, selection, *self._shared])
         return float(value[0]), gradient
+
+
+def _two_loop(pairs: list[tuple[Array, Array]], gradient: Array, mask: Array) -> Array:
+    """Return −H·gradient within the free actions (Nocedal & Wright 2006, algorithm 7.4)."""
+    d = -mask * gradient
+    kept = []
+    for s, y in reversed(pairs):
+        sy = float((s * mask) @ y)
+        rho = 1.0 / sy if sy > 0.0 else 0.0
+        alpha = rho * float((s * mask) @ d)
+        d = d - alpha * mask * y
+        kept.append((s, y, rho, alpha))
+    for _, y, rho, _ in kept:  # the newest pair that can be used sets the scale
+        if rho > 0.0:
+            d = d / (rho * float((y * mask) @ y))
+            break
+    for s, y, rho, alpha in reversed(kept):
+        d = d + (alpha - rho * float((y * mask) @ d)) * mask * s
+    return d

@@ -70,8 +70,8 @@ def _compile(source: str, compiler: str, cache_folder: Path, key: str) -> Path:
 
 
 def _name(key: str, path: Path) -> str:
-    """Name a library by its size too: loading one that is cut short kills the process."""
-    return f"{key}-{path.stat().st_size}.so"
+    """Name a library by its content too: loading one that a crash or a full disk damaged can kill the process."""
+    return f"{key}-{hashlib.sha256(path.read_bytes()).hexdigest()[:16]}.so"
 
 
 def _private_folder() -> Path:

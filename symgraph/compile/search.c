@@ -5,6 +5,7 @@
      struct inputs              what evaluate() needs besides the actions
      int evaluate(const double *x, const struct inputs *in, double *value, double *gradient)
                                 returns 0, or 1 where the model failed
+   interpreted.py does the same, step for step, where there is no compiler: change both.
    Bounds are low[N_ACTIONS], high[N_ACTIONS]; an action with low == high is held. */
 
 enum outcome { CONVERGED, ITERATION_LIMIT, OSCILLATION, STALLED, NOT_FINITE };
@@ -180,7 +181,7 @@ static long long climb(double *x, const struct inputs *in, const double *low, co
 static long long ascend(double *x, const struct inputs *in, const double *low, const double *high, long long limit,
                         double rho, double epsilon, double tolerance, int oscillation, int scaled, int keep_best,
                         double *value, int *outcome, double *history, double *work) {
-  double *g = work, *v = g + N_ACTIONS, *w = v + N_ACTIONS, *best = w + N_ACTIONS;
+  double *g = work, *v = g + N_ACTIONS, *w = v + N_ACTIONS, *best = w + N_ACTIONS, *last = best + N_ACTIONS;
   double j = 0, before, best_value, check = 0;
   long long step = 0;
   int i, falls = 0, failed = evaluate(x, in, &j, g);
@@ -201,6 +202,7 @@ static long long ascend(double *x, const struct inputs *in, const double *low, c
     before = j;
     for (i = 0; i < N_ACTIONS; ++i) {
       double span = scaled ? high[i] - low[i] : 1, slope = g[i] * span, delta;
+      last[i] = x[i];
       v[i] = rho * v[i] + (1 - rho) * slope * slope;
       delta = slope * sqrt((w[i] + epsilon) / (v[i] + epsilon));
       w[i] = rho * w[i] + (1 - rho) * delta * delta;
@@ -210,7 +212,9 @@ static long long ascend(double *x, const struct inputs *in, const double *low, c
     check = 0;
     for (i = 0; i < N_ACTIONS; ++i) check += g[i];
     if (failed || !isfinite(j) || !isfinite(check)) {
-      j = history[++step] = -INFINITY;
+      history[++step] = -INFINITY;
+      j = before; /* the last finite iterate counts */
+      for (i = 0; i < N_ACTIONS; ++i) x[i] = last[i];
       *outcome = NOT_FINITE;
       break;
     }

@@ -143,7 +143,10 @@ class Adadelta(Optimizer):
         if self.polish and not interrupted:
             polished, interrupted = self._polished(problem, ended)
             ended += polished
-        return Search(ended, f"best of {queue.starts} starts", interrupted)
+        status = f"best of {queue.starts} starts"
+        if deaths > MAX_DEATHS:
+            status = f"given up after {len(ended)} runs: worker processes keep dying"
+        return Search(ended, status, interrupted)
 
     @property
     def _steps(self) -> AdadeltaSteps:
