@@ -145,7 +145,7 @@ class Adadelta(Optimizer):
             ended += polished
         status = f"best of {queue.starts} starts"
         if deaths > MAX_DEATHS:
-            status = f"given up after {len(ended)} runs: worker processes keep dying"
+            status = f"best of {len(ended)} runs: given up, because worker processes died again and again"
         return Search(ended, status, interrupted)
 
     @property
