@@ -40,7 +40,7 @@ class BoundModel:
         self.place = place
         self.reads = tuple(dict.fromkeys(reads.values()))  # labels, each once
         self.writes = dict(writes.values())
-        self.parameters: tuple[Parameter, ...] = tuple(getattr(model.function, "parameters", ()))
+        self.parameters = _parameters(model.function)
         self._function = model.function
         self._reads = dict(reads)  # its own name → label
         self._writes = dict(writes)  # its own name → (label, size)
@@ -174,8 +174,13 @@ def bind(model: Any, slots: Mapping[str, Slot], role: str, place: str, branches:
             noise[label] = as_covariance(covariance, slots[label].size, f"{place}: noise on {label!r}")
         except SlotError as error:
             raise GraphError(str(error)) from None
+    noise = {label: covariance for label, covariance in noise.items() if covariance.any()}
     rule = None if is_propagator(model.function) else model.propagation or DEFAULT_PROPAGATION[role]
     return BoundModel(model, reads, writes, slots, rule, noise, place)
+
+
+def _parameters(function: Any) -> tuple[Parameter, ...]:
+    return tuple(getattr(function, "parameters", ())) if is_propagator(function) else ()
 
 
 def _reads(function: Any, place: str) -> list[str]:
@@ -209,7 +214,11 @@ def _written_sizes(
         sigma = {label: ca.MX.sym(label, s.size, s.size) for label, s in slots.items() if isinstance(s, State)}
         sigma = {label: sigma[label] for label in x if label in sigma}
         moments = _call_propagator(function, reads, x, sigma, place)
-        parameters = [parameter.symbol for parameter in getattr(function, "parameters", ())]
+        if not all(isinstance(parameter, Parameter) for parameter in _parameters(function)):
+            raise GraphError(
+                f"{place}: parameters is {_short(function.parameters)}; list objects of symgraph.Parameter"
+            )
+        parameters = [parameter.symbol for parameter in _parameters(function)]
         results = [expression for g in moments.values() for expression in (g.mean, g.covariance)]
         _check_symbols(results, [*x.values(), *sigma.values(), *parameters], place, "list it in `parameters`")
         return {name: gaussian.mean.numel() for name, gaussian in moments.items()}

@@ -215,6 +215,8 @@ class Graph:
         if not isinstance(given, Mapping):
             raise GraphError(f"{place}: give {{{what}: (target, model)}}, got {given!r}")
         for label, pair in given.items():
+            if not isinstance(label, str) or not label:
+                raise GraphError(f"{place}: {what} {label!r} is not a name; give non-empty strings")
             if not isinstance(pair, tuple) or len(pair) != 2:
                 raise GraphError(f"{place}, {what} {label!r}: give (target, model), got {pair!r}")
             _node(pair[0], f"{place}, {what} {label!r}: target")

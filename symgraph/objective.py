@@ -62,11 +62,12 @@ class Build:
         return Outcomes(self._tree, self._uncertain)
 
     def ipopt(self, iterations: int, tolerance: float) -> ca.Function:
-        """Return IPOPT on −J over the actions; its parameters are the other inputs, stacked."""
+        """Return IPOPT on −J/scale over the actions; its parameters are the other inputs and the scale, stacked."""
         if (iterations, tolerance) not in self._solvers:
             expectation = self.expectation
             actions, *others = expectation.inputs.symbols
-            problem: Any = {"x": actions, "p": ca.veccat(*others), "f": -expectation.value}
+            scale = ca.MX.sym("scale")
+            problem: Any = {"x": actions, "p": ca.veccat(*others, scale), "f": -expectation.value / scale}
             options: Any = {
                 "print_time": False,
                 "error_on_fail": False,
@@ -216,7 +217,8 @@ class Objective:
             label, place = next(iter(missing.items()))
             hint = did_you_mean(label, [x for x in given if x not in self.tree.needed_states])
             raise InputError(f"state {label!r} is missing: {place} reads it{hint} Missing in all: {names(missing)}")
-        uncertain = frozenset(label for label in self.tree.needed_states if isinstance(state[label], Gaussian))
+        # A variance of zero is exact: formulas for a spread may not survive it (0 · ∞ where a slope is infinite).
+        uncertain = frozenset(label for label in self.tree.needed_states if np.any(given[label].covariance))
         if uncertain not in self._builds:
             self._builds[uncertain] = Build(self.tree, uncertain, self._compiled)
         empty = [np.zeros(0)]

@@ -196,6 +196,18 @@ class NodeOutcomes(Sequence[NodeOutcome]):
                 values[node.parent] += self.shares[node.index] * values[node.index]
         return values
 
+    @property
+    def _cut_probability(self) -> float:
+        """Probability that some path is cut: branches of a group exclude each other, groups are independent."""
+        cut = np.zeros(len(self))
+        for node in reversed(self.tree.nodes):
+            escape = 1.0 - float(node.cut)
+            for tree_group in node.groups:
+                children = [b.child for b in tree_group.branches if b.child is not None and self.shares[b.child]]
+                escape *= 1.0 - sum(self.shares[child] * cut[child] for child in children)
+            cut[node.index] = 1.0 - escape
+        return float(cut[0])
+
     def _reward(self, index: int) -> float:
         return float(sum(self._flat[offset] for offset in self._layouts[index].rewards))
 
@@ -212,12 +224,18 @@ class NodeOutcomes(Sequence[NodeOutcome]):
                 continue
             for tree_group in node.groups:
                 if isinstance(tree_group.group.probability, BoundModel):
+                    for branch in tree_group.branches:
+                        share = self.shares[branch.child or 0]
+                        if not -1e-6 <= share <= 1.0 + 1e-6:
+                            name = branch.branch.label
+                            where = self.tree.path(node.index)
+                            found.append(f"the probability of {name!r} at {where!r} is {share:.3g}, outside [0, 1]")
                     total = sum(self.shares[b.child] for b in tree_group.branches if b.child is not None)
                     if not abs(total - 1.0) <= 1e-6:
                         found.append(
                             f"the probabilities at {self.tree.path(node.index)!r} sum to {total:.6g}, not to 1"
                         )
-        cut = sum(self.probabilities[node.index] for node in self.tree.nodes if node.cut)
+        cut = self._cut_probability
         if cut:
             found.append(
                 f"a node recurs more than {self.tree.max_visits} times with probability {cut:.3g}; such a path counts "

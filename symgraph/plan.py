@@ -78,7 +78,7 @@ class Plan:
         lines.append(f"value {self.value + 0.0:.6g}: {self.status}")
         lines.append(f"  {gradients} gradients in {1e3 * self.seconds:.1f} ms by {self.optimizer}, seed {self.seed}")
         lines += [f"  note: {note}" for note in self.notes]
-        reached = [node for node in self.nodes if node.probability > 0.0]
+        reached = [node for node in self.nodes if node.probability]
         for node in reached[:SHOWN_NODES]:
             reward = f", reward {node.reward:.4g}" if node.reward else ""
             lines.append(f"  {node.path}: probability {node.probability:.3g}{reward}{' (cut)' if node.cut else ''}")

@@ -56,14 +56,14 @@ long long symgraph_climb(double *x, const double *selection, const double *const
 }}
 long long symgraph_ascend(double *x, const double *selection, const double *const *shared, const double *low,
                           const double *high, long long limit, double decay, double epsilon, double tolerance,
-                          int oscillation, int scaled, int keep_best, double *value, int *outcome, double *history,
-                          double *w) {{
+                          double scale, int oscillation, int scaled, int keep_best, double *value, int *outcome,
+                          double *history, double *w) {{
   struct inputs in;
   in.selections = selection;
   in.shared = shared;
   in.w = w;
-  return ascend(x, &in, low, high, limit, decay, epsilon, tolerance, oscillation, scaled, keep_best, value, outcome,
-                history, w + {work});
+  return ascend(x, &in, low, high, limit, decay, epsilon, tolerance, scale, oscillation, scaled, keep_best, value,
+                outcome, history, w + {work});
 }}
 int symgraph_work(void) {{ return {work} + SEARCH_WORK; }}
 """
@@ -106,7 +106,7 @@ class CompiledKernel(Kernel):
         library.symgraph_evaluate.restype = None
         library.symgraph_climb.argtypes = [*[pointer] * 5, whole, number, *[pointer] * 4]
         library.symgraph_climb.restype = whole
-        steps = [whole, number, number, number, ctypes.c_int, ctypes.c_int, ctypes.c_int]
+        steps = [whole, *[number] * 4, ctypes.c_int, ctypes.c_int, ctypes.c_int]
         library.symgraph_ascend.argtypes = [*[pointer] * 5, *steps, *[pointer] * 4]
         library.symgraph_ascend.restype = whole
         self.library: Any = library
@@ -164,7 +164,7 @@ class _BoundCompiled(BoundKernel):
         return self._search(function, start, selection, iterations, (iterations, tolerance))
 
     def ascend(self, start: Array, selection: Array, limit: int, steps: AdadeltaSteps) -> Ended:
-        numbers = steps.decay, steps.epsilon, steps.tolerance
+        numbers = steps.decay, steps.epsilon, steps.tolerance, steps.scale
         settings = (limit, *numbers, steps.oscillation, steps.scaled, steps.keep_best)
         return self._search(self._kernel.library.symgraph_ascend, start, selection, limit + 1, settings)
 

@@ -18,7 +18,8 @@ LONGEST_STEP = 0.5
 ARMIJO = 1e-4
 SMALLEST_GAIN = 1e-15
 MOST_PAIRS = 8
-MOST_BACKTRACKS = 40
+CURVATURE = 0.9
+MOST_TRIES = 50
 
 
 class FlatFunction:
@@ -73,8 +74,11 @@ class _BoundInterpreted(BoundKernel):
         return values, gradients
 
     def climb(self, start: Array, selection: Array, iterations: int, tolerance: float) -> Ended:
+        def place(u: Array) -> Array:
+            return np.clip(self._low + span * u, self._low, self._high)  # rounding must not carry it past a bound
+
         def descend(u: Array) -> tuple[float, Array, bool]:
-            value, gradient = self._at(self._low + span * u, selection)
+            value, gradient = self._at(place(u), selection)
             gradient = -gradient * span
             return -value, gradient, bool(np.isfinite(value) and np.isfinite(gradient).all())
 
@@ -86,53 +90,65 @@ class _BoundInterpreted(BoundKernel):
         pairs: list[tuple[Array, Array]] = []  # (step, gradient change), newest last
         most = min(max(len(u), 1), MOST_PAIRS)
         history, outcome = [-f], "iteration limit"
-        fresh, flat, backtracks, reach, t = True, 0, 0, FIRST_STEP, 1.0
-        d = np.zeros_like(u)
+        fresh, flat, tries = True, 0, 0
+        d, descent, longest = np.zeros_like(u), 0.0, 0.0
+        t, t_low, t_high = 1.0, 0.0, np.inf  # steps between which the line search looks
+        f_low, u_low, g_low = f, u, g
         while True:
             noise = SMALLEST_GAIN * abs(f)
+            accepted = False
             if fresh:
                 free = ~((span <= 0.0) | ((u <= 0.0) & (g > 0.0)) | ((u >= 1.0) & (g < 0.0)))
                 slope = float(np.abs(g * free).max(initial=0.0))
-                if slope <= tolerance * (1.0 + abs(f)):
+                if slope <= tolerance:
                     outcome = "converged"
                     break
                 d = _two_loop(pairs, g, free.astype(float))
-                if not pairs or not d @ g < 0.0:  # nothing known of the curvature: along the gradient
-                    d = -g * free * (reach / slope)
-                longest = float(np.abs(d).max())
-                if longest > LONGEST_STEP:
-                    d = d * (LONGEST_STEP / longest)
-                t, backtracks, fresh = 1.0, 0, False
+                if not pairs or not d @ (g * free) < 0.0:  # nothing known of the curvature: along the gradient
+                    d = -g * free * (FIRST_STEP / slope)
+                descent, longest = float(d @ (g * free)), float(np.abs(d).max())
+                t = LONGEST_STEP / longest if longest > LONGEST_STEP else 1.0
+                t_low, t_high, tries, fresh = 0.0, np.inf, 0, False
+            if len(history) >= iterations:
+                accepted = t_low > 0.0
+            else:
+                trial = np.clip(u + t * d, 0.0, 1.0)
+                predicted = float(g @ (trial - u))
+                f_trial, g_trial, finite = descend(trial)
+                slope_trial = float(g_trial @ (d * ((trial > 0.0) & (trial < 1.0))))
+                tries += 1
+                if finite and f_trial <= f + ARMIJO * predicted + noise:  # the best so far, if not yet a good one
+                    t_low, f_low, u_low, g_low = t, f_trial, trial, g_trial
+                    accepted = slope_trial >= CURVATURE * descent or f - f_trial <= noise or tries > MOST_TRIES
+                    accepted = accepted or (t_high == np.inf and t * longest >= LONGEST_STEP)
+                    t = min(4.0 * t, LONGEST_STEP / longest) if t_high == np.inf else (t_low + t_high) / 2.0
+                else:
+                    t_high = t
+                    if t_low > 0.0:
+                        t = (t_low + t_high) / 2.0
+                    else:  # the minimum of the parabola through f, its slope and the new value, within bounds
+                        rise = f_trial - f - predicted
+                        shrink = -predicted / (2.0 * rise) if finite and rise > 0.0 else 0.1
+                        t *= min(max(shrink, 0.1), 0.5)
+                    if tries > MOST_TRIES or np.abs(trial - u).max() <= 1e-16:
+                        accepted = t_low > 0.0
+                        if not accepted:  # no step gains; if the pairs are to blame, the gradient alone still will
+                            outcome = outcome if pairs else "stalled"
+                            pairs, fresh = [], True
+            if accepted:
+                step, change = u_low - u, g_low - g
+                if step @ change > 1e-12 * np.sqrt((step @ step) * (change @ change)):
+                    pairs = [*pairs, (step, change)][-most:]
+                flat = flat + 1 if f - f_low <= noise else 0
+                u, f, g, fresh = u_low, f_low, g_low, True
             if len(history) >= iterations:
                 break
-            trial = np.clip(u + t * d, 0.0, 1.0)
-            moved = trial - u
-            predicted = float(g @ moved)
-            f_trial, g_trial, finite = descend(trial)
-            if finite and f_trial <= f + ARMIJO * predicted + noise:
-                change = g_trial - g
-                if moved @ change > 1e-12 * np.sqrt((moved @ moved) * (change @ change)):
-                    pairs = [*pairs[1 - most :], (moved, change)] if most > 1 else [(moved, change)]
-                else:  # curved the wrong way: what was learnt does not help; on along the gradient with longer steps
-                    pairs, reach = [], float(np.clip(2.0 * np.sqrt(moved @ moved), 1e-12, LONGEST_STEP))
-                flat = flat + 1 if f - f_trial <= noise else 0
-                u, f, g, fresh = trial, f_trial, g_trial, True
-            else:
-                # The minimum of the parabola through f, its slope and the new value, within a tenth to a half.
-                rise = f_trial - f - predicted
-                t *= min(max(-predicted / (2.0 * rise) if finite and rise > 0.0 else 0.1, 0.1), 0.5)
-                backtracks += 1
-                if backtracks > MOST_BACKTRACKS or np.abs(moved).max() <= 1e-16:
-                    if not pairs:  # no step gains any more
-                        outcome = "stalled"
-                        history.append(-f)
-                        break
-                    pairs, reach, fresh = [], 1e-3, True  # if the pairs are to blame, the gradient alone still gains
-            history.append(-f)
+            history.append(-(min(f, f_low) if t_low > 0.0 and not accepted else f))
             if flat >= 2:
                 outcome = "converged"
+            if outcome != "iteration limit":
                 break
-        return Ended(self._low + span * u, -f, cast(Outcome, outcome), np.array(history))
+        return Ended(place(u), -f, cast(Outcome, outcome), np.array(history))
 
     def ascend(self, start: Array, selection: Array, limit: int, steps: AdadeltaSteps) -> Ended:
         x, low, high = start.copy(), self._low, self._high
@@ -146,7 +162,7 @@ class _BoundInterpreted(BoundKernel):
         outcome: Outcome = "iteration limit"
         while len(history) <= limit:
             before, last = value, x
-            slope = gradient * span
+            slope = gradient * span / steps.scale
             v = steps.decay * v + (1.0 - steps.decay) * slope * slope
             delta = slope * np.sqrt((w + steps.epsilon) / (v + steps.epsilon))
             w = steps.decay * w + (1.0 - steps.decay) * delta * delta

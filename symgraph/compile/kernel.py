@@ -19,6 +19,7 @@ class AdadeltaSteps:
     decay: float
     epsilon: float
     tolerance: float
+    scale: float  # size of J, which gradients are divided by [reward]
     oscillation: int
     scaled: bool
     keep_best: bool
@@ -64,7 +65,7 @@ class BoundKernel(ABC):
             start: (n,) actions.
             selection: (m,) one-hot.
             iterations: gradients at most.
-            tolerance: largest element of the projected gradient over (x − low)/(high − low), relative to 1 + |J|.
+            tolerance: largest element of the projected gradient over (x − low)/(high − low) that is converged [reward].
         """
 
     @abstractmethod

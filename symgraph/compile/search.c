@@ -11,11 +11,13 @@
 enum outcome { CONVERGED, ITERATION_LIMIT, OSCILLATION, STALLED, NOT_FINITE };
 
 #define PAIRS (N_ACTIONS < 8 ? (N_ACTIONS > 0 ? N_ACTIONS : 1) : 8) /* curvature pairs that L-BFGS keeps */
-#define SEARCH_WORK (2 * PAIRS * (N_ACTIONS + 1) + 8 * N_ACTIONS)     /* doubles of workspace */
+#define SEARCH_WORK (2 * PAIRS * (N_ACTIONS + 1) + 10 * N_ACTIONS)    /* doubles of workspace */
 
 static const double FIRST_STEP = 0.05;     /* [range] no curvature is known yet */
 static const double LONGEST_STEP = 0.5;    /* [range] no step crosses more than half of it */
 static const double ARMIJO = 1e-4;         /* sufficient decrease: Nocedal & Wright 2006, equation 3.4 */
+static const double CURVATURE = 0.9;       /* how much flatter a step must end: equation 3.6b there */
+static const int MOST_TRIES = 50;          /* steps of one line search */
 static const double SMALLEST_GAIN = 1e-15; /* relative to the value: less cannot be told from rounding */
 
 static double dot(const double *a, const double *b, const double *mask) {
@@ -32,12 +34,18 @@ static double largest(const double *a) {
   return found;
 }
 
+/* x = low + (high - low) u, which rounding must not carry past a bound. */
+static void place(const double *u, const double *low, const double *high, double *x) {
+  int i;
+  for (i = 0; i < N_ACTIONS; ++i) x[i] = fmin(fmax(low[i] + (high[i] - low[i]) * u[i], low[i]), high[i]);
+}
+
 /* f = -J and its gradient over u = (x - low) / (high - low); returns whether all is finite. */
 static int descend_value(const double *u, const struct inputs *in, const double *low, const double *high, double *x,
                          double *f, double *g) {
   double value = 0, check = 0;
   int i;
-  for (i = 0; i < N_ACTIONS; ++i) x[i] = low[i] + (high[i] - low[i]) * u[i];
+  place(u, low, high, x);
   if (evaluate(x, in, &value, g)) return 0;
   for (i = 0; i < N_ACTIONS; ++i) {
     g[i] *= -(high[i] - low[i]);
@@ -47,16 +55,19 @@ static int descend_value(const double *u, const struct inputs *in, const double 
   return isfinite(value) && isfinite(check);
 }
 
-/* Climb from x to a local maximum within the bounds by projected L-BFGS (Liu & Nocedal 1989).
+/* Climb from x to a local maximum within the bounds by projected L-BFGS (Liu & Nocedal 1989). The line search brackets a
+   step that satisfies the weak Wolfe conditions, with which BFGS also gets past kinks (Lewis & Overton 2013).
    history takes up to `iterations` values, one for each gradient; returns their number. */
 static long long climb(double *x, const struct inputs *in, const double *low, const double *high, long long iterations,
                        double tolerance, double *value, int *outcome, double *history, double *work) {
   double *s = work, *y = s + PAIRS * N_ACTIONS, *rho = y + PAIRS * N_ACTIONS, *alpha = rho + PAIRS;
   double *u = alpha + PAIRS, *g = u + N_ACTIONS, *d = g + N_ACTIONS, *trial = d + N_ACTIONS, *g_trial = trial + N_ACTIONS;
-  double *moved = g_trial + N_ACTIONS, *mask = moved + N_ACTIONS, *change = mask + N_ACTIONS;
-  double f = 0, f_trial = 0, t = 1, reach = FIRST_STEP;
+  double *u_low = g_trial + N_ACTIONS, *g_low = u_low + N_ACTIONS, *mask = g_low + N_ACTIONS, *step = mask + N_ACTIONS;
+  double *change = step + N_ACTIONS;
+  double f = 0, f_low = 0, f_trial = 0, descent = 0, longest = 0;
+  double t = 1, t_low = 0, t_high = INFINITY; /* steps between which the line search looks */
   long long spent = 1;
-  int i, k, stored = 0, newest = -1, fresh = 1, flat = 0, backtracks = 0;
+  int i, k, stored = 0, newest = -1, fresh = 1, flat = 0, tries = 0;
 
   for (i = 0; i < N_ACTIONS; ++i) u[i] = high[i] > low[i] ? fmin(fmax((x[i] - low[i]) / (high[i] - low[i]), 0), 1) : 0;
   if (!descend_value(u, in, low, high, x, &f, g)) {
@@ -67,17 +78,17 @@ static long long climb(double *x, const struct inputs *in, const double *low, co
   history[0] = -f;
   *outcome = ITERATION_LIMIT;
   for (;;) {
-    double predicted = 0, noise = SMALLEST_GAIN * fabs(f), longest;
-    int finite, gained;
+    double predicted = 0, slope_trial = 0, noise = SMALLEST_GAIN * fabs(f);
+    int finite, gained, accepted = 0;
     if (fresh) {
-      double slope = 0, scale = 1, descent;
+      double slope = 0, scale = 1;
       for (i = 0; i < N_ACTIONS; ++i) {
         int held = high[i] <= low[i] || (u[i] <= 0 && g[i] > 0) || (u[i] >= 1 && g[i] < 0);
         mask[i] = held ? 0 : 1;
         slope = fmax(slope, mask[i] * fabs(g[i]));
         d[i] = -mask[i] * g[i];
       }
-      if (slope <= tolerance * (1 + fabs(f))) {
+      if (slope <= tolerance) {
         *outcome = CONVERGED;
         break;
       }
@@ -89,7 +100,7 @@ static long long climb(double *x, const struct inputs *in, const double *low, co
         alpha[p] = rho[p] * dot(s + p * N_ACTIONS, d, mask);
         for (i = 0; i < N_ACTIONS; ++i) d[i] -= alpha[p] * mask[i] * y[p * N_ACTIONS + i];
       }
-      for (k = 0; k < stored; ++k) {
+      for (k = 0; k < stored; ++k) { /* the newest pair that can be used sets the scale */
         int p = (newest - k + PAIRS) % PAIRS;
         if (rho[p] > 0) {
           scale = 1 / (rho[p] * dot(y + p * N_ACTIONS, y + p * N_ACTIONS, mask));
@@ -104,83 +115,100 @@ static long long climb(double *x, const struct inputs *in, const double *low, co
       }
       descent = dot(d, g, mask);
       if (stored == 0 || !(descent < 0)) { /* nothing known of the curvature: along the gradient */
-        for (i = 0; i < N_ACTIONS; ++i) d[i] = -mask[i] * g[i] * (reach / slope);
+        for (i = 0; i < N_ACTIONS; ++i) d[i] = -mask[i] * g[i] * (FIRST_STEP / slope);
+        descent = dot(d, g, mask);
       }
       longest = largest(d);
-      if (longest > LONGEST_STEP)
-        for (i = 0; i < N_ACTIONS; ++i) d[i] *= LONGEST_STEP / longest;
-      t = 1;
-      backtracks = 0;
+      t = longest > LONGEST_STEP ? LONGEST_STEP / longest : 1;
+      t_low = 0;
+      t_high = INFINITY;
+      tries = 0;
       fresh = 0;
     }
-    if (spent >= iterations) break;
-    for (i = 0; i < N_ACTIONS; ++i) {
-      trial[i] = fmin(fmax(u[i] + t * d[i], 0), 1);
-      moved[i] = trial[i] - u[i];
-      predicted += g[i] * moved[i];
+    if (spent >= iterations) {
+      accepted = t_low > 0;
+    } else {
+      for (i = 0; i < N_ACTIONS; ++i) {
+        trial[i] = fmin(fmax(u[i] + t * d[i], 0), 1);
+        step[i] = trial[i] - u[i];
+        predicted += g[i] * step[i];
+      }
+      finite = descend_value(trial, in, low, high, x, &f_trial, g_trial);
+      gained = finite && f_trial <= f + ARMIJO * predicted + noise;
+      for (i = 0; i < N_ACTIONS; ++i)
+        if (trial[i] > 0 && trial[i] < 1) slope_trial += g_trial[i] * d[i];
+      ++tries;
+      if (gained) { /* the best step so far, if not yet a good one */
+        t_low = t;
+        f_low = f_trial;
+        for (i = 0; i < N_ACTIONS; ++i) {
+          u_low[i] = trial[i];
+          g_low[i] = g_trial[i];
+        }
+        accepted = slope_trial >= CURVATURE * descent || f - f_trial <= noise || tries > MOST_TRIES ||
+                   (isinf(t_high) && t * longest >= LONGEST_STEP);
+        t = isinf(t_high) ? fmin(4 * t, LONGEST_STEP / longest) : (t_low + t_high) / 2;
+      } else {
+        t_high = t;
+        if (t_low > 0) {
+          t = (t_low + t_high) / 2;
+        } else { /* the minimum of the parabola through f, its slope and the new value, within a tenth to a half */
+          double rise = f_trial - f - predicted;
+          double shrink = finite && rise > 0 ? -predicted / (2 * rise) : 0.1;
+          t *= fmin(fmax(shrink, 0.1), 0.5);
+        }
+        if (tries > MOST_TRIES || largest(step) <= 1e-16) {
+          accepted = t_low > 0;
+          if (!accepted) {
+            /* No step gains any more. If the curvature pairs are to blame, the gradient alone will still gain. */
+            if (stored == 0) *outcome = STALLED;
+            fresh = 1;
+          }
+        }
+      }
     }
-    finite = descend_value(trial, in, low, high, x, &f_trial, g_trial);
-    gained = finite && f_trial <= f + ARMIJO * predicted + noise;
-    if (gained) {
+    if (accepted) {
       double sy = 0, ss = 0, yy = 0;
       for (i = 0; i < N_ACTIONS; ++i) {
-        change[i] = g_trial[i] - g[i];
-        sy += moved[i] * change[i];
-        ss += moved[i] * moved[i];
+        step[i] = u_low[i] - u[i];
+        change[i] = g_low[i] - g[i];
+        sy += step[i] * change[i];
+        ss += step[i] * step[i];
         yy += change[i] * change[i];
       }
       if (sy > 1e-12 * sqrt(ss * yy)) {
         newest = (newest + 1) % PAIRS;
         if (stored < PAIRS) ++stored;
         for (i = 0; i < N_ACTIONS; ++i) {
-          s[newest * N_ACTIONS + i] = moved[i];
+          s[newest * N_ACTIONS + i] = step[i];
           y[newest * N_ACTIONS + i] = change[i];
         }
-      } else { /* curved the wrong way: what was learnt does not help; on along the gradient with longer steps */
-        stored = 0;
-        reach = fmin(fmax(2 * sqrt(ss), 1e-12), LONGEST_STEP);
       }
-      flat = f - f_trial <= noise ? flat + 1 : 0;
-      f = f_trial;
+      flat = f - f_low <= noise ? flat + 1 : 0;
+      f = f_low;
       for (i = 0; i < N_ACTIONS; ++i) {
-        u[i] = trial[i];
-        g[i] = g_trial[i];
+        u[i] = u_low[i];
+        g[i] = g_low[i];
       }
       fresh = 1;
-    } else {
-      /* The minimum of the parabola through f, its slope and the new value, within a tenth to a half of the step. */
-      double rise = f_trial - f - predicted;
-      double shrink = finite && rise > 0 ? -predicted / (2 * rise) : 0.1;
-      t *= fmin(fmax(shrink, 0.1), 0.5);
-      ++backtracks;
-      if (backtracks > 40 || largest(moved) <= 1e-16) {
-        /* No step gains any more. If the curvature pairs are to blame, the gradient alone will still gain. */
-        if (stored == 0) {
-          *outcome = STALLED;
-          history[spent++] = -f;
-          break;
-        }
-        stored = 0;
-        reach = 1e-3;
-        fresh = 1;
-      }
+    } else if (fresh) {
+      stored = 0;
     }
-    history[spent++] = -f;
-    if (flat >= 2) {
-      *outcome = CONVERGED;
-      break;
-    }
+    if (spent >= iterations) break;
+    history[spent++] = -(t_low > 0 && !accepted ? fmin(f, f_low) : f);
+    if (flat >= 2) *outcome = CONVERGED;
+    if (*outcome != ITERATION_LIMIT) break;
   }
-  for (i = 0; i < N_ACTIONS; ++i) x[i] = low[i] + (high[i] - low[i]) * u[i];
+  place(u, low, high, x);
   *value = -f;
   return spent;
 }
 
 /* Move x by ADADELTA (Zeiler, arXiv:1212.5701, algorithm 1, with the sign of ascent) for at most `limit` steps.
-   history takes up to limit + 1 values, the start's first; returns their number. */
+   J is divided by `scale`. history takes up to limit + 1 values, the start's first; returns their number. */
 static long long ascend(double *x, const struct inputs *in, const double *low, const double *high, long long limit,
-                        double rho, double epsilon, double tolerance, int oscillation, int scaled, int keep_best,
-                        double *value, int *outcome, double *history, double *work) {
+                        double rho, double epsilon, double tolerance, double scale, int oscillation, int scaled,
+                        int keep_best, double *value, int *outcome, double *history, double *work) {
   double *g = work, *v = g + N_ACTIONS, *w = v + N_ACTIONS, *best = w + N_ACTIONS, *last = best + N_ACTIONS;
   double j = 0, before, best_value, check = 0;
   long long step = 0;
@@ -201,7 +229,7 @@ static long long ascend(double *x, const struct inputs *in, const double *low, c
   while (step < limit) {
     before = j;
     for (i = 0; i < N_ACTIONS; ++i) {
-      double span = scaled ? high[i] - low[i] : 1, slope = g[i] * span, delta;
+      double span = scaled ? high[i] - low[i] : 1, slope = g[i] * span / scale, delta;
       last[i] = x[i];
       v[i] = rho * v[i] + (1 - rho) * slope * slope;
       delta = slope * sqrt((w[i] + epsilon) / (v[i] + epsilon));

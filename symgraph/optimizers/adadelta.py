@@ -11,7 +11,7 @@ import numpy as np
 
 from symgraph.compile.kernel import AdadeltaSteps, BoundKernel, Ended
 from symgraph.errors import InputError
-from symgraph.optimizers.lbfgs import climbed, number, positive_whole
+from symgraph.optimizers.lbfgs import climbed, number, positive_whole, status_of
 from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
 from symgraph.slots import Array
 
@@ -44,12 +44,12 @@ class Adadelta(Optimizer):
         run_iterations: steps of one run.
         total_iterations: steps of all runs together; default starts · run_iterations.
         finished: finished points wanted; default all starts.
-        tolerance: gain below which a step counts as converged [reward].
+        tolerance: gain below which a step counts as converged [the spread of J over the bounds if scaled, else reward].
         oscillation: falling steps that end a run.
         sampling: "spread" (Latin hypercube), "uniform" or "gaussian" (around the middle, a quarter of the range).
         evenly: spread the starts evenly over the combinations of selections; else uniformly at random.
         requeue: points go back to the queue after a run; else each start has one run.
-        scaled: steps in units of the bounds' range.
+        scaled: actions in units of the bounds' range and rewards in units of the spread of J over the bounds.
         keep_best: a run's result is its best iterate; else its last.
         polish: climb on from the best runs of each combination with L-BFGS.
         start_per_selection: one more start for each selection variable, as in the paper.
@@ -143,14 +143,15 @@ class Adadelta(Optimizer):
         if self.polish and not interrupted:
             polished, interrupted = self._polished(problem, ended)
             ended += polished
-        status = f"best of {queue.starts} starts"
+        status = status_of(problem, ended, queue.starts)
         if deaths > MAX_DEATHS:
             status = f"best of {len(ended)} runs: given up, because worker processes died again and again"
         return Search(ended, status, interrupted)
 
-    @property
-    def _steps(self) -> AdadeltaSteps:
-        return AdadeltaSteps(self.decay, self.epsilon, self.tolerance, self.oscillation, self.scaled, self.keep_best)
+    def _steps(self, problem: Problem) -> AdadeltaSteps:
+        scale = problem.scale if self.scaled else 1.0
+        numbers = self.decay, self.epsilon, self.tolerance * scale
+        return AdadeltaSteps(*numbers, scale, self.oscillation, self.scaled, self.keep_best)
 
     @staticmethod
     def _polished(problem: Problem, runs: list[Run]) -> tuple[list[Run], bool]:
@@ -243,7 +244,7 @@ def _movers(processes: int) -> Iterator[Callable[[Adadelta, Problem, list[Run], 
 
 def _task(settings: Adadelta, problem: Problem, batch: list[Run], limit: int) -> tuple[Any, ...]:
     points, choices = np.array([run.point for run in batch]), np.array([run.choices for run in batch])
-    return problem.kernel, points, problem.one_hot(choices), limit, settings._steps
+    return problem.kernel, points, problem.one_hot(choices), limit, settings._steps(problem)
 
 
 def _joined(batch: list[Run], ended: list[Ended]) -> list[Run]:

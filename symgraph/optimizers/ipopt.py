@@ -29,7 +29,7 @@ class Ipopt(Optimizer):
 
     Args:
         iterations: at most.
-        tolerance: of the optimality conditions.
+        tolerance: of the optimality conditions, with J divided by its spread over the bounds.
         samples: points looked at for a start, shared by the combinations of selections.
 
     Source: Wächter & Biegler 2006.
@@ -73,7 +73,7 @@ class Ipopt(Optimizer):
         if problem.n == 0:
             return Run(point, point, choice, start_value, "converged", np.array([start_value]))
         solver = problem.situation.build.ipopt(self.iterations, self.tolerance)
-        parameters = np.concatenate([hot[0], *problem.situation.shared])
+        parameters = np.concatenate([hot[0], *problem.situation.shared, [problem.scale]])
         found = solver(x0=point, lbx=problem.low, ubx=problem.high, p=parameters)
         statistics = solver.stats()
         status = str(statistics["return_status"])
@@ -83,5 +83,6 @@ class Ipopt(Optimizer):
         value = float(problem.values(end[None], choice[None])[0])
         if not value >= start_value:  # not finite half-way, or gone astray: the start is the better plan
             end, value = point, start_value
-        history = -np.array(statistics.get("iterations", {}).get("obj", [-start_value]))
+        objectives = statistics.get("iterations", {}).get("obj", [-start_value / problem.scale])
+        history = -problem.scale * np.array(objectives)
         return Run(point, end, choice, value, _OUTCOMES.get(status, "stalled"), history)

@@ -19,15 +19,17 @@ class Lbfgs(Optimizer):
 
     For each combination of selections, `samples` points are spread over the bounds and evaluated; of the better half,
     those farthest from any better one are climbed from, since they most likely lead to other maxima. Where there are
-    more combinations than `starts`, a random part of them is tried.
+    more combinations than `starts`, those with the best samples are climbed in, and the status says how many.
 
     Args:
         starts: points climbed from, shared evenly by the combinations of selections (at least one each).
         samples: points evaluated per start, up to 1024 for a combination.
         iterations: gradient evaluations of one climb at most.
-        tolerance: largest element of the projected gradient, per range and relative to 1 + |J|, that is converged.
+        tolerance: largest element of the projected gradient, per range and relative to the spread of J over the bounds,
+            that counts as converged.
 
-    Source: Liu & Nocedal 1989 (L-BFGS); the choice of start points after Rinnooy Kan & Timmer 1987.
+    Source: Liu & Nocedal 1989 (L-BFGS); Lewis & Overton 2013 (its line search, which gets past kinks); the choice of
+        start points after Rinnooy Kan & Timmer 1987.
     """
 
     starts: int = 16
@@ -46,7 +48,15 @@ class Lbfgs(Optimizer):
             guessed, guessed_choices = problem.started_from_guesses(rng)
             points, choices = np.concatenate([guessed, points]), np.concatenate([guessed_choices, choices])
         runs = climbed(problem, points, choices, self.iterations, self.tolerance)
-        return Search(runs, f"best of {len(points)} starts", interrupted=len(runs) < len(points))
+        return Search(runs, status_of(problem, runs, len(points)), interrupted=len(runs) < len(points))
+
+
+def status_of(problem: Problem, runs: list[Run], starts: int) -> str:
+    """Say how many starts a result is the best of, and whether combinations of selections were left out."""
+    tried = len({run.choices.tobytes() for run in runs})
+    if tried == problem.combinations:
+        return f"best of {starts} starts"
+    return f"best of {starts} starts, which tried {tried} of {problem.combinations} combinations of selections"
 
 
 def climbed(problem: Problem, points: Array, choices: Choices, iterations: int, tolerance: float) -> list[Run]:
@@ -55,7 +65,7 @@ def climbed(problem: Problem, points: Array, choices: Choices, iterations: int, 
     runs: list[Run] = []
     try:
         for p in range(len(points)):
-            ended = problem.kernel.climb(points[p], hot[p], iterations, tolerance)
+            ended = problem.kernel.climb(points[p], hot[p], iterations, tolerance * problem.scale)
             runs.append(Run.of(points[p], choices[p], ended))
             problem.progress.update(p + 1, len(points))
     except KeyboardInterrupt:
@@ -65,17 +75,20 @@ def climbed(problem: Problem, points: Array, choices: Choices, iterations: int, 
 
 def promising_points(problem: Problem, rng: np.random.Generator, starts: int, samples: int) -> tuple[Array, Choices]:
     """Return start points (P, n) and their choices (P, s): the most promising of samples spread over the bounds."""
-    each = max(1, starts // problem.combinations)
-    groups = problem.draw_choices(rng, min(problem.combinations, starts), evenly=True)
+    looked_at = min(problem.combinations, max(starts, MOST_SAMPLES))
+    groups = problem.draw_choices(rng, looked_at, evenly=True)
+    each = max(1, starts // looked_at)
     count = max(each, min(each * samples, MOST_SAMPLES)) if problem.n else 1
     points = np.concatenate([problem.draw_points(rng, count, "spread") for _ in groups])
     choices = np.repeat(groups, count, axis=0)
     values = problem.values(points, choices)
     unit = problem.unit(points)
     kept = []
-    for k in range(len(groups)):
+    for k in range(looked_at):
         block = np.arange(k * count, (k + 1) * count)
         kept += [block[i] for i in _peaks(unit[block], values[block], each)]
+    if looked_at > starts:  # not every combination has a start: those with the best samples have
+        kept = [kept[i] for i in np.argsort(-values[kept], kind="stable")[:starts]]
     return points[kept], choices[kept]
 
 

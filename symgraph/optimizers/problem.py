@@ -6,6 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,8 @@ from symgraph.compile.kernel import BoundKernel, Ended, Outcome
 from symgraph.objective import Situation
 from symgraph.progress import Progress
 from symgraph.slots import Array
+
+SCALE_SAMPLES = 64
 
 Choices = npt.NDArray[np.int64]  # (P, number of selections): which choice of each selection, a row per point
 
@@ -70,6 +73,22 @@ class Problem:
         span = self.high - self.low
         return (points - self.low) / np.where(span > 0.0, span, 1.0)
 
+    @cached_property
+    def scale(self) -> float:
+        """Size of the differences of J that matter here: the middle half of sampled values spans it [reward].
+
+        Tolerances are relative to it, so that scaling the rewards, or adding a constant to them, changes nothing.
+        """
+        rng = np.random.default_rng(0)
+        choices = self.draw_choices(rng, SCALE_SAMPLES, evenly=True)
+        values = np.sort(self.values(self.draw_points(rng, SCALE_SAMPLES, "spread"), choices))
+        finite = values[np.isfinite(values)]
+        for share in (4, SCALE_SAMPLES):  # a peak on a plain: then the whole range
+            spread = finite[-1 - len(finite) // share] - finite[len(finite) // share] if len(finite) else 0.0
+            if spread > 0.0:
+                return float(spread)
+        return 1.0
+
     def draw_choices(self, rng: np.random.Generator, count: int, evenly: bool) -> Choices:
         """Draw choices (count, s): evenly over the combinations, or independently and uniformly."""
         if not evenly or self.combinations > 10**9:
@@ -104,7 +123,7 @@ class Problem:
         if sampling == "spread":
             ranks = rng.permuted(np.tile(np.arange(count)[:, None], (1, self.n)), axis=0)
             unit = (ranks + unit) / count
-        return self.low + (self.high - self.low) * unit
+        return np.clip(self.low + (self.high - self.low) * unit, self.low, self.high)
 
     def started_from_guesses(self, rng: np.random.Generator) -> tuple[Array, Choices]:
         """Return the guesses as points (P, n) and choices (P, s), what they leave out drawn at random."""
