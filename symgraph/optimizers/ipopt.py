@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from types import FrameType
 
 import numpy as np
 
@@ -74,11 +79,12 @@ class Ipopt(Optimizer):
             return Run(point, point, choice, start_value, "converged", np.array([start_value]))
         solver = problem.situation.build.ipopt(self.iterations, self.tolerance)
         parameters = np.concatenate([hot[0], *problem.situation.shared, [problem.scale]])
-        found = solver(x0=point, lbx=problem.low, ubx=problem.high, p=parameters)
+        with _interrupts() as interrupted:
+            found = solver(x0=point, lbx=problem.low, ubx=problem.high, p=parameters)
+        if interrupted:
+            raise KeyboardInterrupt
         statistics = solver.stats()
         status = str(statistics["return_status"])
-        if status == "User_Requested_Stop":
-            raise KeyboardInterrupt
         end = np.clip(np.array(found["x"]).ravel(), problem.low, problem.high)
         value = float(problem.values(end[None], choice[None])[0])
         if not value >= start_value:  # not finite half-way, or gone astray: the start is the better plan
@@ -86,3 +92,23 @@ class Ipopt(Optimizer):
         objectives = statistics.get("iterations", {}).get("obj", [-start_value / problem.scale])
         history = -problem.scale * np.array(objectives)
         return Run(point, end, choice, value, _OUTCOMES.get(status, "stalled"), history)
+
+
+@contextmanager
+def _interrupts() -> Iterator[list[int]]:
+    """Note Ctrl-C in the list that is yielded: CasADi swallows the exception and reports one of several statuses."""
+    noted: list[int] = []
+    if threading.current_thread() is not threading.main_thread():  # only that one is interrupted
+        yield noted
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def note(number: int, frame: FrameType | None) -> None:
+        noted.append(number)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield noted
+    finally:
+        signal.signal(signal.SIGINT, before)
