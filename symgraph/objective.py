@@ -27,7 +27,7 @@ class Build:
         self._tree = tree
         self._uncertain = uncertain
         self._compiled = compiled
-        self._solvers: dict[tuple[int, float], ca.Function] = {}
+        self.kept: dict[Any, Any] = {}  # what optimizers derive from the expression and use again
 
     @cached_property
     def expectation(self) -> Expectation:
@@ -60,22 +60,6 @@ class Build:
     @cached_property
     def outcomes(self) -> Outcomes:
         return Outcomes(self._tree, self._uncertain)
-
-    def ipopt(self, iterations: int, tolerance: float) -> ca.Function:
-        """Return IPOPT on −J/scale over the actions; its parameters are the other inputs and the scale, stacked."""
-        if (iterations, tolerance) not in self._solvers:
-            expectation = self.expectation
-            actions, *others = expectation.inputs.symbols
-            scale = ca.MX.sym("scale")
-            problem: Any = {"x": actions, "p": ca.veccat(*others, scale), "f": -expectation.value / scale}
-            options: Any = {
-                "print_time": False,
-                "error_on_fail": False,
-                "show_eval_warnings": False,
-                "ipopt": {"print_level": 0, "sb": "yes", "max_iter": iterations, "tol": tolerance},
-            }
-            self._solvers[iterations, tolerance] = ca.nlpsol("ipopt", "ipopt", problem, options)
-        return self._solvers[iterations, tolerance]
 
 
 @dataclass(frozen=True)

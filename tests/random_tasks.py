@@ -277,9 +277,7 @@ class _Maker:
             return Edge(self.make_branch(node, below))
         if kind == "choose":
             selection = self.pick(selections)
-            return Choose(
-                selection, {way: self.make_branch(node, below) for way in self.slots[selection].choices}
-            )
+            return Choose(selection, {way: self.make_branch(node, below) for way in self.slots[selection].choices})
         names = ["hit", "miss", "lost"][: self.rng.integers(2, 4)]
         branches = {name: self.make_branch(node, below) for name in names}
         if self.chance(0.4):
@@ -468,7 +466,6 @@ def to_symgraph(problem: Problem) -> tuple[Any, dict[str, Any], tuple[dict, dict
     if task.start != problem.graph_start:
         options["start"] = task.start
     state = {
-        label: sg.Gaussian(*given) if isinstance(given, tuple) else given
-        for label, given in problem.state.items()
+        label: sg.Gaussian(*given) if isinstance(given, tuple) else given for label, given in problem.state.items()
     }
     return graph, options, (state, problem.actions, problem.selections)

@@ -276,9 +276,7 @@ def test_default_propagation_of_edge_probability_and_reward():
     graph = sg.Graph({"x": sg.State(), "y": sg.State()}, start="here")
     graph.edge("here", "squared", lambda x: {"y": x**2})
     graph.reward("squared", lambda y: y)
-    graph.chance(
-        "here", {"hit": ("paid", None), "miss": ("over", None)}, lambda x: {"hit": x**2, "miss": 1 - x**2}
-    )
+    graph.chance("here", {"hit": ("paid", None), "miss": ("over", None)}, lambda x: {"hit": x**2, "miss": 1 - x**2})
     graph.reward("paid", lambda x: 10 * x)
     graph.reward("here", lambda x: 100 * x**2)
     expected = m**2 + m**2 * 10 * m + 100 * (m**2 + s)

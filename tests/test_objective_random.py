@@ -64,9 +64,7 @@ def differences(function, point):
 def assert_agree(got, expected, tolerance, scale=0.0):
     """Within the tolerance relative to 1 + the largest number at play."""
     assert np.shape(got) == np.shape(expected)
-    np.testing.assert_allclose(
-        got, expected, rtol=0, atol=tolerance * (1 + max(np.max(np.abs(expected)), abs(scale)))
-    )
+    np.testing.assert_allclose(got, expected, rtol=0, atol=tolerance * (1 + max(np.max(np.abs(expected)), abs(scale))))
 
 
 def test_value_equals_the_oracle(case):

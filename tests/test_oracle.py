@@ -34,9 +34,7 @@ def differences(function, x, step=1e-3):
     """Central differences, the direction last, with the h^2 term of their error extrapolated away."""
 
     def central(h):
-        return np.stack(
-            [(function(x + h * e) - function(x - h * e)) / (2 * h) for e in np.eye(len(x))], axis=-1
-        )
+        return np.stack([(function(x + h * e) - function(x - h * e)) / (2 * h) for e in np.eye(len(x))], axis=-1)
 
     return (4 * central(step / 2) - central(step)) / 3
 
@@ -84,9 +82,7 @@ def test_softmax_sums_to_one_and_its_derivatives_to_zero():
 def test_each_rule_on_a_sine(rule, mean, variance):
     sine = Smooth({"x": 1}, {"x": 1}, ("sin",), np.eye(1), np.zeros(1), np.zeros((1, 1, 1)))
     model = Model(sine, propagation=rule, noise={"x": 0.01})
-    ((got_mean, got_covariance),) = propagate(
-        model, {"x": (np.array([0.4]), np.array([[0.09]]))}, "linear"
-    ).values()
+    ((got_mean, got_covariance),) = propagate(model, {"x": (np.array([0.4]), np.array([[0.09]]))}, "linear").values()
     np.testing.assert_allclose(got_mean, [mean], rtol=1e-15)
     np.testing.assert_allclose(got_covariance, [[variance + 0.01]], rtol=1e-15)
 
@@ -305,9 +301,7 @@ def features(problem) -> set[str]:
     note("model reads a selection", any(task.slots[label].kind == "selection" for label in read))
     note("function used on several edges", any(count > 1 for count in uses.values()))
     note("renamed read", any(model.label(name) != name for model in models for name in model.function.reads))
-    note(
-        "renamed write", any(model.label(name) != name for model in models for name in model.function.writes)
-    )
+    note("renamed write", any(model.label(name) != name for model in models for name in model.function.writes))
     found |= {f"{model.propagation or 'default'} propagation" for model in models}
     note("noise", any(np.any(noise) for model in models for noise in model.noise.values()))
     given = [value for value in problem.state.values() if isinstance(value, tuple)]

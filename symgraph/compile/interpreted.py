@@ -19,6 +19,7 @@ ARMIJO = 1e-4
 SMALLEST_GAIN = 1e-15
 MOST_PAIRS = 8
 CURVATURE = 0.9
+MOST_ROUNDS = 10
 MOST_TRIES = 50
 
 
@@ -103,10 +104,10 @@ class _BoundInterpreted(BoundKernel):
                 if slope <= tolerance:
                     outcome = "converged"
                     break
-                d = _two_loop(pairs, g, free.astype(float))
-                if not pairs or not d @ (g * free) < 0.0:  # nothing known of the curvature: along the gradient
+                d = _direction(pairs, u, g, free.astype(float))
+                if not pairs or not d @ g < 0.0:  # nothing known of the curvature: along the gradient
                     d = -g * free * (FIRST_STEP / slope)
-                descent, longest = float(d @ (g * free)), float(np.abs(d).max())
+                descent, longest = float(d @ g), float(np.abs(d).max())
                 t = LONGEST_STEP / longest if longest > LONGEST_STEP else 1.0
                 t_low, t_high, tries, fresh = 0.0, np.inf, 0, False
             if len(history) >= iterations:
@@ -117,7 +118,9 @@ class _BoundInterpreted(BoundKernel):
                 f_trial, g_trial, finite = descend(trial)
                 slope_trial = float(g_trial @ (d * ((trial > 0.0) & (trial < 1.0))))
                 tries += 1
-                if finite and f_trial <= f + ARMIJO * predicted + noise:  # the best so far, if not yet a good one
+                if (
+                    finite and predicted < 0.0 and f_trial <= f + ARMIJO * predicted + noise
+                ):  # the best so far, if not yet a good one
                     t_low, f_low, u_low, g_low = t, f_trial, trial, g_trial
                     accepted = slope_trial >= CURVATURE * descent or f - f_trial <= noise or tries > MOST_TRIES
                     accepted = accepted or (t_high == np.inf and t * longest >= LONGEST_STEP)
@@ -139,7 +142,8 @@ class _BoundInterpreted(BoundKernel):
                 step, change = u_low - u, g_low - g
                 if step @ change > 1e-12 * np.sqrt((step @ step) * (change @ change)):
                     pairs = [*pairs, (step, change)][-most:]
-                flat = flat + 1 if f - f_low <= noise else 0
+                # Gains lost in rounding mean that it has arrived, but not if the step had to be cut down for them.
+                flat = flat + 1 if f - f_low <= noise and tries == 1 else 0
                 u, f, g, fresh = u_low, f_low, g_low, True
             if len(history) >= iterations:
                 break
@@ -188,6 +192,21 @@ class _BoundInterpreted(BoundKernel):
     def _at(self, actions: Array, selection: Array) -> tuple[float, Array]:
         value, gradient = self._function([actions, selection, *self._shared])
         return float(value[0]), gradient
+
+
+def _direction(pairs: list[tuple[Array, Array]], u: Array, gradient: Array, mask: Array) -> Array:
+    """Return −H·gradient, but send actions that it would carry past a bound to that bound (Bertsekas 1982)."""
+    to_bound = np.zeros_like(u)
+    for _ in range(MOST_ROUNDS):
+        d = _two_loop(pairs, gradient, mask)
+        end = u + d
+        hits = (mask > 0.0) & ((end < 0.0) | (end > 1.0))
+        if not hits.any():
+            break
+        downhill = hits & (d * gradient < 0.0)
+        to_bound[downhill] = np.where(end < 0.0, 0.0, 1.0)[downhill] - u[downhill]
+        mask = np.where(hits, 0.0, mask)
+    return np.where(mask > 0.0, d, to_bound)
 
 
 def _two_loop(pairs: list[tuple[Array, Array]], gradient: Array, mask: Array) -> Array:

@@ -11,14 +11,24 @@
 enum outcome { CONVERGED, ITERATION_LIMIT, OSCILLATION, STALLED, NOT_FINITE };
 
 #define PAIRS (N_ACTIONS < 8 ? (N_ACTIONS > 0 ? N_ACTIONS : 1) : 8) /* curvature pairs that L-BFGS keeps */
-#define SEARCH_WORK (2 * PAIRS * (N_ACTIONS + 1) + 10 * N_ACTIONS)    /* doubles of workspace */
+#define SEARCH_WORK (2 * PAIRS * N_ACTIONS + 11 * N_ACTIONS + 1)          /* doubles of workspace */
 
 static const double FIRST_STEP = 0.05;     /* [range] no curvature is known yet */
 static const double LONGEST_STEP = 0.5;    /* [range] no step crosses more than half of it */
 static const double ARMIJO = 1e-4;         /* sufficient decrease: Nocedal & Wright 2006, equation 3.4 */
 static const double CURVATURE = 0.9;       /* how much flatter a step must end: equation 3.6b there */
+static const int MOST_ROUNDS = 10;         /* of sending actions to their bounds */
 static const int MOST_TRIES = 50;          /* steps of one line search */
 static const double SMALLEST_GAIN = 1e-15; /* relative to the value: less cannot be told from rounding */
+
+/* The last steps and gradient changes, in a ring. */
+struct pairs {
+  double *s, *y; /* PAIRS times N_ACTIONS */
+  int stored, newest;
+};
+
+/* Where the k-th newest pair begins. */
+static int nth(const struct pairs *pairs, int k) { return (pairs->newest - k + PAIRS) % PAIRS * N_ACTIONS; }
 
 static double dot(const double *a, const double *b, const double *mask) {
   double sum = 0;
@@ -55,19 +65,72 @@ static int descend_value(const double *u, const struct inputs *in, const double 
   return isfinite(value) && isfinite(check);
 }
 
+/* d = -H g within the actions of the mask, by the two-loop recursion over the curvature pairs, newest first (Nocedal &
+   Wright 2006, algorithm 7.4). */
+static void quasi_newton(const struct pairs *pairs, const double *g, const double *mask, double *d) {
+  double alpha[PAIRS], rho[PAIRS], scale = 1;
+  int i, k;
+  for (i = 0; i < N_ACTIONS; ++i) d[i] = -mask[i] * g[i];
+  for (k = 0; k < pairs->stored; ++k) {
+    const double *s = pairs->s + nth(pairs, k), *y = pairs->y + nth(pairs, k);
+    double sy = dot(s, y, mask);
+    rho[k] = sy > 0 ? 1 / sy : 0;
+    alpha[k] = rho[k] * dot(s, d, mask);
+    for (i = 0; i < N_ACTIONS; ++i) d[i] -= alpha[k] * mask[i] * y[i];
+  }
+  for (k = 0; k < pairs->stored; ++k) { /* the newest pair that can be used sets the scale */
+    const double *y = pairs->y + nth(pairs, k);
+    if (rho[k] > 0) {
+      scale = 1 / (rho[k] * dot(y, y, mask));
+      break;
+    }
+  }
+  for (i = 0; i < N_ACTIONS; ++i) d[i] *= scale;
+  for (k = pairs->stored - 1; k >= 0; --k) {
+    const double *s = pairs->s + nth(pairs, k), *y = pairs->y + nth(pairs, k);
+    double beta = rho[k] * dot(y, d, mask);
+    for (i = 0; i < N_ACTIONS; ++i) d[i] += (alpha[k] - beta) * mask[i] * s[i];
+  }
+}
+
+/* The same, but actions that it would carry past a bound go to that bound, and the others do without them: clipping the
+   step afterwards can leave no descent (Bertsekas 1982). The mask loses those actions. Returns the slope along d. */
+static double direction(const struct pairs *pairs, const double *u, const double *g, double *mask, double *d) {
+  double slope = 0, to_bound[N_ACTIONS + 1];
+  int i, hits = 1, rounds;
+  for (i = 0; i < N_ACTIONS; ++i) to_bound[i] = 0;
+  for (rounds = 0; rounds < MOST_ROUNDS && hits; ++rounds) {
+    hits = 0;
+    quasi_newton(pairs, g, mask, d);
+    for (i = 0; i < N_ACTIONS; ++i) {
+      double end = u[i] + d[i];
+      if (mask[i] > 0 && (end < 0 || end > 1)) {
+        if (d[i] * g[i] < 0) to_bound[i] = (end < 0 ? 0 : 1) - u[i];
+        mask[i] = 0;
+        hits = 1;
+      }
+    }
+  }
+  for (i = 0; i < N_ACTIONS; ++i) {
+    if (mask[i] == 0) d[i] = to_bound[i];
+    slope += g[i] * d[i];
+  }
+  return slope;
+}
+
 /* Climb from x to a local maximum within the bounds by projected L-BFGS (Liu & Nocedal 1989). The line search brackets a
    step that satisfies the weak Wolfe conditions, with which BFGS also gets past kinks (Lewis & Overton 2013).
    history takes up to `iterations` values, one for each gradient; returns their number. */
 static long long climb(double *x, const struct inputs *in, const double *low, const double *high, long long iterations,
                        double tolerance, double *value, int *outcome, double *history, double *work) {
-  double *s = work, *y = s + PAIRS * N_ACTIONS, *rho = y + PAIRS * N_ACTIONS, *alpha = rho + PAIRS;
-  double *u = alpha + PAIRS, *g = u + N_ACTIONS, *d = g + N_ACTIONS, *trial = d + N_ACTIONS, *g_trial = trial + N_ACTIONS;
+  struct pairs pairs = {work, work + PAIRS * N_ACTIONS, 0, -1};
+  double *u = work + 2 * PAIRS * N_ACTIONS, *g = u + N_ACTIONS, *d = g + N_ACTIONS, *trial = d + N_ACTIONS, *g_trial = trial + N_ACTIONS;
   double *u_low = g_trial + N_ACTIONS, *g_low = u_low + N_ACTIONS, *mask = g_low + N_ACTIONS, *step = mask + N_ACTIONS;
-  double *change = step + N_ACTIONS;
+  double *change = step + N_ACTIONS, *free = change + N_ACTIONS;
   double f = 0, f_low = 0, f_trial = 0, descent = 0, longest = 0;
   double t = 1, t_low = 0, t_high = INFINITY; /* steps between which the line search looks */
   long long spent = 1;
-  int i, k, stored = 0, newest = -1, fresh = 1, flat = 0, tries = 0;
+  int i, fresh = 1, flat = 0, tries = 0;
 
   for (i = 0; i < N_ACTIONS; ++i) u[i] = high[i] > low[i] ? fmin(fmax((x[i] - low[i]) / (high[i] - low[i]), 0), 1) : 0;
   if (!descend_value(u, in, low, high, x, &f, g)) {
@@ -81,42 +144,24 @@ static long long climb(double *x, const struct inputs *in, const double *low, co
     double predicted = 0, slope_trial = 0, noise = SMALLEST_GAIN * fabs(f);
     int finite, gained, accepted = 0;
     if (fresh) {
-      double slope = 0, scale = 1;
+      double slope = 0;
       for (i = 0; i < N_ACTIONS; ++i) {
         int held = high[i] <= low[i] || (u[i] <= 0 && g[i] > 0) || (u[i] >= 1 && g[i] < 0);
         mask[i] = held ? 0 : 1;
         slope = fmax(slope, mask[i] * fabs(g[i]));
-        d[i] = -mask[i] * g[i];
       }
       if (slope <= tolerance) {
         *outcome = CONVERGED;
         break;
       }
-      /* Two-loop recursion within the free actions (Nocedal & Wright 2006, algorithm 7.4), newest pair first. */
-      for (k = 0; k < stored; ++k) {
-        int p = (newest - k + PAIRS) % PAIRS;
-        double sy = dot(s + p * N_ACTIONS, y + p * N_ACTIONS, mask);
-        rho[p] = sy > 0 ? 1 / sy : 0;
-        alpha[p] = rho[p] * dot(s + p * N_ACTIONS, d, mask);
-        for (i = 0; i < N_ACTIONS; ++i) d[i] -= alpha[p] * mask[i] * y[p * N_ACTIONS + i];
-      }
-      for (k = 0; k < stored; ++k) { /* the newest pair that can be used sets the scale */
-        int p = (newest - k + PAIRS) % PAIRS;
-        if (rho[p] > 0) {
-          scale = 1 / (rho[p] * dot(y + p * N_ACTIONS, y + p * N_ACTIONS, mask));
-          break;
+      for (i = 0; i < N_ACTIONS; ++i) free[i] = mask[i];
+      descent = direction(&pairs, u, g, mask, d);
+      if (pairs.stored == 0 || !(descent < 0)) { /* nothing known of the curvature: along the gradient */
+        descent = 0;
+        for (i = 0; i < N_ACTIONS; ++i) {
+          d[i] = -free[i] * g[i] * (FIRST_STEP / slope);
+          descent += g[i] * d[i];
         }
-      }
-      for (i = 0; i < N_ACTIONS; ++i) d[i] *= scale;
-      for (k = stored - 1; k >= 0; --k) {
-        int p = (newest - k + PAIRS) % PAIRS;
-        double beta = rho[p] * dot(y + p * N_ACTIONS, d, mask);
-        for (i = 0; i < N_ACTIONS; ++i) d[i] += (alpha[p] - beta) * mask[i] * s[p * N_ACTIONS + i];
-      }
-      descent = dot(d, g, mask);
-      if (stored == 0 || !(descent < 0)) { /* nothing known of the curvature: along the gradient */
-        for (i = 0; i < N_ACTIONS; ++i) d[i] = -mask[i] * g[i] * (FIRST_STEP / slope);
-        descent = dot(d, g, mask);
       }
       longest = largest(d);
       t = longest > LONGEST_STEP ? LONGEST_STEP / longest : 1;
@@ -134,7 +179,7 @@ static long long climb(double *x, const struct inputs *in, const double *low, co
         predicted += g[i] * step[i];
       }
       finite = descend_value(trial, in, low, high, x, &f_trial, g_trial);
-      gained = finite && f_trial <= f + ARMIJO * predicted + noise;
+      gained = finite && predicted < 0 && f_trial <= f + ARMIJO * predicted + noise;
       for (i = 0; i < N_ACTIONS; ++i)
         if (trial[i] > 0 && trial[i] < 1) slope_trial += g_trial[i] * d[i];
       ++tries;
@@ -161,7 +206,7 @@ static long long climb(double *x, const struct inputs *in, const double *low, co
           accepted = t_low > 0;
           if (!accepted) {
             /* No step gains any more. If the curvature pairs are to blame, the gradient alone will still gain. */
-            if (stored == 0) *outcome = STALLED;
+            if (pairs.stored == 0) *outcome = STALLED;
             fresh = 1;
           }
         }
@@ -177,14 +222,15 @@ static long long climb(double *x, const struct inputs *in, const double *low, co
         yy += change[i] * change[i];
       }
       if (sy > 1e-12 * sqrt(ss * yy)) {
-        newest = (newest + 1) % PAIRS;
-        if (stored < PAIRS) ++stored;
+        pairs.newest = (pairs.newest + 1) % PAIRS;
+        if (pairs.stored < PAIRS) ++pairs.stored;
         for (i = 0; i < N_ACTIONS; ++i) {
-          s[newest * N_ACTIONS + i] = step[i];
-          y[newest * N_ACTIONS + i] = change[i];
+          pairs.s[nth(&pairs, 0) + i] = step[i];
+          pairs.y[nth(&pairs, 0) + i] = change[i];
         }
       }
-      flat = f - f_low <= noise ? flat + 1 : 0;
+      /* Gains lost in rounding mean that it has arrived, but not if the step had to be cut down for them. */
+      flat = f - f_low <= noise && tries == 1 ? flat + 1 : 0;
       f = f_low;
       for (i = 0; i < N_ACTIONS; ++i) {
         u[i] = u_low[i];
@@ -192,7 +238,7 @@ static long long climb(double *x, const struct inputs *in, const double *low, co
       }
       fresh = 1;
     } else if (fresh) {
-      stored = 0;
+      pairs.stored = 0;
     }
     if (spent >= iterations) break;
     history[spent++] = -(t_low > 0 && !accepted ? fmin(f, f_low) : f);

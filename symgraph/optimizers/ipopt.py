@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from types import FrameType
+from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from symgraph.compile.kernel import Outcome
+from symgraph.objective import Build
 from symgraph.optimizers.lbfgs import number, positive_whole, promising_points
 from symgraph.optimizers.problem import Choices, Optimizer, Problem, Run, Search
 from symgraph.slots import Array
@@ -60,29 +62,27 @@ class Ipopt(Optimizer):
             points, choices = points[best : best + 1], choices[best : best + 1]
         runs: list[Run] = []
         problem.progress.wait("planning")
-        try:
+        with _interrupts() as interrupted:
             for point, choice in zip(points, choices, strict=True):
-                runs.append(self._from(problem, point, choice))
-        except KeyboardInterrupt:
-            return Search(runs, "", interrupted=True)
+                run = self._from(problem, point, choice, interrupted)
+                if interrupted:
+                    return Search(runs, "", interrupted=True)
+                runs.append(run)
         if len(runs) > 1:
             return Search(runs, f"best of {len(runs)} starts")
         ended = runs[0].outcome
         return Search(runs, ended if ended == "converged" else f"not converged: {ended}")
 
-    def _from(self, problem: Problem, point: Array, choice: Choices) -> Run:
+    def _from(self, problem: Problem, point: Array, choice: Choices, interrupted: list[int]) -> Run:
         hot = problem.one_hot(choice[None])
         start_value = float(problem.values(point[None], choice[None])[0])
         if not np.isfinite(start_value):
             return Run(point, point, choice, start_value, "not finite", np.array([start_value]))
         if problem.n == 0:
             return Run(point, point, choice, start_value, "converged", np.array([start_value]))
-        solver = problem.situation.build.ipopt(self.iterations, self.tolerance)
+        solver = self._solver(problem.situation.build, interrupted)
         parameters = np.concatenate([hot[0], *problem.situation.shared, [problem.scale]])
-        with _interrupts() as interrupted:
-            found = solver(x0=point, lbx=problem.low, ubx=problem.high, p=parameters)
-        if interrupted:
-            raise KeyboardInterrupt
+        found = solver(x0=point, lbx=problem.low, ubx=problem.high, p=parameters)
         statistics = solver.stats()
         status = str(statistics["return_status"])
         end = np.clip(np.array(found["x"]).ravel(), problem.low, problem.high)
@@ -93,21 +93,66 @@ class Ipopt(Optimizer):
         history = -problem.scale * np.array(objectives)
         return Run(point, end, choice, value, _OUTCOMES.get(status, "stalled"), history)
 
+    def _solver(self, build: Build, interrupted: list[int]) -> ca.Function:
+        """Return IPOPT on −J/scale over the actions; its parameters are the other inputs and the scale, stacked."""
+        if self not in build.kept:
+            expectation = build.expectation
+            actions, *others = expectation.inputs.symbols
+            scale = ca.MX.sym("scale")
+            others_and_scale = ca.veccat(*others, scale)
+            watch = _Watch(actions.numel(), others_and_scale.numel())
+            problem: Any = {"x": actions, "p": others_and_scale, "f": -expectation.value / scale}
+            options: Any = {
+                "print_time": False,
+                "error_on_fail": False,
+                "show_eval_warnings": False,
+                "iteration_callback": watch,
+                "ipopt": {"print_level": 0, "sb": "yes", "max_iter": self.iterations, "tol": self.tolerance},
+            }
+            build.kept[self] = ca.nlpsol("ipopt", "ipopt", problem, options), watch
+        solver: ca.Function
+        solver, watch = build.kept[self]
+        watch.interrupted = interrupted
+        return solver
+
+
+class _Watch(ca.Callback):
+    """Is called after each iteration of IPOPT and ends it after Ctrl-C."""
+
+    def __init__(self, n_actions: int, n_parameters: int) -> None:
+        ca.Callback.__init__(self)
+        self.interrupted: list[int] = []
+        self._sizes = {"x": n_actions, "lam_x": n_actions, "f": 1, "lam_p": n_parameters}
+        self.construct("watch", {})
+
+    def get_n_in(self) -> int:
+        return int(ca.nlpsol_n_out())
+
+    def get_n_out(self) -> int:
+        return 1
+
+    def get_name_in(self, i: int) -> str:
+        return str(ca.nlpsol_out(i))
+
+    def get_name_out(self, i: int) -> str:
+        return "ret"
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        size = self._sizes.get(self.get_name_in(i), 0)
+        return ca.Sparsity.dense(size, 1) if size else ca.Sparsity(0, 0)
+
+    def eval(self, arguments: Sequence[ca.DM]) -> list[ca.DM]:
+        return [ca.DM(len(self.interrupted))]
+
 
 @contextmanager
 def _interrupts() -> Iterator[list[int]]:
-    """Note Ctrl-C in the list that is yielded: CasADi swallows the exception and reports one of several statuses."""
+    """Note Ctrl-C in the list that is yielded, since CasADi would swallow a KeyboardInterrupt."""
     noted: list[int] = []
     if threading.current_thread() is not threading.main_thread():  # only that one is interrupted
         yield noted
         return
-    before = signal.getsignal(signal.SIGINT)
-
-    def note(number: int, frame: FrameType | None) -> None:
-        noted.append(number)
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGINT, note)
+    before = signal.signal(signal.SIGINT, lambda number, frame: noted.append(number))
     try:
         yield noted
     finally:

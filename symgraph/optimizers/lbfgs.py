@@ -34,7 +34,7 @@ class Lbfgs(Optimizer):
 
     starts: int = 16
     samples: int = 8
-    iterations: int = 500
+    iterations: int = 2000
     tolerance: float = 1e-9
 
     def __post_init__(self) -> None:
