@@ -46,3 +46,11 @@ __all__ = [
     "solve",
     "unroll",
 ]
+
+
+def __getattr__(name: str) -> str:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("symgraph")
+    raise AttributeError(f"module 'symgraph' has no attribute {name!r}")

@@ -49,6 +49,9 @@ class BoundModel:
         self._noise = dict(noise)
         self._built: dict[tuple[str, ...], ca.Function] = {}
 
+    def __getstate__(self) -> dict[str, Any]:  # CasADi's expressions do not travel; they are built anew
+        return {**self.__dict__, "_built": {}}
+
     def apply(self, inputs: Mapping[str, Gaussian]) -> dict[str, Gaussian]:
         """Return what the model writes, given the Gaussians (of MX) of at least what it reads."""
         function, uncertain = self.moments(inputs)
@@ -61,7 +64,7 @@ class BoundModel:
 
     def spread(self, uncertain: frozenset[str]) -> set[str]:
         """Return which of the written labels are uncertain when those given are."""
-        function = self._built_for(tuple(label for label in self.reads if label in uncertain))
+        function = self.function_for(tuple(label for label in self.reads if label in uncertain))
         n = len(self.writes)
         return {label for i, label in enumerate(self.writes) if function.nnz_out(n + i)}
 
@@ -72,9 +75,10 @@ class BoundModel:
         are the means of all writes and then their covariances.
         """
         uncertain = tuple(label for label in self.reads if inputs[label].covariance.nnz())
-        return self._built_for(uncertain), uncertain
+        return self.function_for(uncertain), uncertain
 
-    def _built_for(self, uncertain: tuple[str, ...]) -> ca.Function:
+    def function_for(self, uncertain: tuple[str, ...]) -> ca.Function:
+        """Return the function of `moments` for given uncertain labels, in the order of `reads`."""
         if uncertain not in self._built:
             build = self._build_propagator if is_propagator(self._function) else self._build_function
             self._built[uncertain] = build(uncertain)
@@ -94,7 +98,7 @@ class BoundModel:
             covariance + kind(ca.DM(self._noise[label])) if label in self._noise else covariance
             for label, (_, covariance) in zip(self.writes, moments, strict=True)
         ]
-        results = [m for m, _ in moments] + covariances
+        results = [m for m, _ in moments] + [_full(c) for c in covariances]
         results = ca.cse(results) if results else []
         return ca.Function(_identifier(self.name), [*x.values(), *sigma.values()], results)
 
@@ -102,7 +106,7 @@ class BoundModel:
         x = {label: kind.sym(_identifier(label), self._sizes[label]) for label in self.reads}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)  # numpy's functions work on CasADi's columns
-            returned = self._function(**{name: x[label] for name, label in self._reads.items()})  # type: ignore[operator]
+            returned = self._function(**{name: kind(x[label]) for name, label in self._reads.items()})  # type: ignore[operator]
         if not isinstance(returned, Mapping):
             returned = {REWARD: returned}
         return x, {label: _column(returned[name], kind) for name, (label, _) in self._writes.items()}
@@ -119,7 +123,7 @@ class BoundModel:
         function = ca.Function(
             _identifier(self.name),
             [*x.values(), *sigma.values(), *(parameter.symbol for parameter in self.parameters)],
-            [g.mean for g in gaussians.values()] + covariances,
+            [ca.densify(g.mean) for g in gaussians.values()] + [_full(c) for c in covariances],
         )
         if self.parameters:  # weights are matrices: scalar by scalar they would be millions of instructions
             return function
@@ -224,10 +228,11 @@ def _written_sizes(
         return {name: gaussian.mean.numel() for name, gaussian in moments.items()}
 
     def call(kind: Any) -> tuple[Any, list[Any]]:
+        # Copies are handed out: a model may change its arguments in place.
         x = {label: kind.sym(_identifier(label), slots[label].size) for label in reads.values()}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)  # numpy's functions work on CasADi's columns
-            return function(**{name: x[label] for name, label in reads.items()}), list(x.values())
+            return function(**{name: kind(x[label]) for name, label in reads.items()}), list(x.values())
 
     kind: Any = ca.SX
     try:
@@ -351,6 +356,11 @@ def _column(value: Any, kind: Any) -> Any:
     if isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.dtype == object):
         value = ca.vertcat(*value)
     return ca.densify(kind(value))
+
+
+def _full(covariance: Any) -> Any:
+    """Make a covariance dense, or leave it without non-zeros."""
+    return ca.densify(covariance) if covariance.nnz() else covariance
 
 
 def _article(slot: Slot) -> str:

@@ -58,6 +58,13 @@ class Parameter:
             raise SlotError(f"parameter {self.name!r}: shape {new.shape} for {self._value.shape}; the shape is fixed")
         self._value = new
 
+    def __getstate__(self) -> dict[str, Any]:  # a CasADi symbol does not travel; another one serves
+        return {"name": self.name, "_value": self._value}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.symbol = ca.MX.sym(self.name, *self._value.shape)
+
     def _checked(self, value: Any) -> Array:
         numbers = as_numbers(value, f"parameter {self.name!r}")
         if numbers.ndim > 2:

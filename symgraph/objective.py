@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,7 +15,7 @@ from symgraph.compile.interpreted import FlatFunction
 from symgraph.compile.kernel import Kernel
 from symgraph.errors import InputError, SlotError, did_you_mean, names
 from symgraph.expectation import Expectation, expected_value
-from symgraph.outcomes import NodeOutcomes, Outcomes
+from symgraph.outcomes import ModelNumbers, Moments, NodeOutcomes, walk
 from symgraph.slots import Action, Array, Gaussian, Selection, Slot, as_column, unchecked_gaussian
 from symgraph.tree import Tree
 
@@ -57,10 +57,6 @@ class Build:
     def has_kernel(self) -> bool:
         return "kernel" in self.__dict__
 
-    @cached_property
-    def outcomes(self) -> Outcomes:
-        return Outcomes(self._tree, self._uncertain)
-
 
 @dataclass(frozen=True)
 class Situation:
@@ -98,6 +94,7 @@ class Objective:
         self.graph = tree.graph
         self._compiled = compiled
         self._builds: dict[frozenset[str], Build] = {}
+        self._models = ModelNumbers()
 
     def value(
         self,
@@ -172,8 +169,25 @@ class Objective:
     ) -> NodeOutcomes:
         """Return what happens at every node: probability, the slots' Gaussians, reward and value; see `value`."""
         situation = self.situation(state)
-        columns = [self.stack_actions(actions), self.one_hot(selections), *situation.shared]
-        return situation.build.outcomes(columns, selections or {}, situation.given)
+        self.one_hot(selections)  # checks them
+        return self.outcomes_of(situation, self.stack_actions(actions), selections or {})
+
+    def outcomes_of(self, situation: Situation, actions: Array, selections: Mapping[str, str]) -> NodeOutcomes:
+        """Return the outcomes for a checked situation and stacked actions (n,)."""
+        here: dict[str, Moments] = {label: (column, None) for label, column in self._columns(actions, selections)}
+        for label, gaussian in situation.given.items():
+            exact = not np.any(gaussian.covariance)
+            here[label] = np.atleast_1d(gaussian.mean), None if exact else np.ravel(gaussian.covariance)
+        return walk(self.tree, here, dict(selections), self._models)
+
+    def _columns(self, actions: Array, selections: Mapping[str, str]) -> Iterator[tuple[str, Array]]:
+        where = stacked_index(self.graph.actions())
+        yield from ((label, actions[where[label]]) for label in where)
+        for label, slot in self.graph.selections().items():
+            yield label, np.array([float(choice == selections[label]) for choice in slot.choices])
+
+    def __getstate__(self) -> dict[str, Any]:  # what is derived from the tree does not travel; it is built anew
+        return {**self.__dict__, "_builds": {}, "_models": ModelNumbers()}
 
     @cached_property
     def n_actions(self) -> int:

@@ -12,7 +12,6 @@ import numpy as np
 
 from symgraph.binding import REWARD, BoundModel
 from symgraph.compile.interpreted import FlatFunction
-from symgraph.expectation import Dictionary, Inputs
 from symgraph.slots import Array, Gaussian, unchecked_gaussian
 from symgraph.tree import Tree
 
@@ -40,113 +39,92 @@ class NodeOutcome:
     cut: bool
 
 
-@dataclass(frozen=True)
-class _Layout:
-    """Where in the flat vector of outcomes things stand, per tree node."""
-
-    states: dict[str, tuple[int, int, int]]  # label → offset of the mean, of the covariance (-1: exact), size
-    rewards: tuple[int, ...]
-    shares: dict[int, int]  # child → offset of its branch's probability, where a model computes it
+Moments = tuple[Array, Array | None]  # mean (n,), covariance (n²,) in column-major order or None: exact
 
 
-class Outcomes:
-    """Computes the outcomes of all nodes of a tree; unselected branches too, which may be NaN without harm.
+class ModelNumbers:
+    """Evaluates models in numbers, each with the function that its expression is made of."""
+
+    def __init__(self) -> None:
+        self._functions: dict[tuple[BoundModel, tuple[str, ...]], tuple[FlatFunction, ca.Function]] = {}
+
+    def __call__(self, model: BoundModel, here: Mapping[str, Moments]) -> dict[str, Moments]:
+        """Return what a model writes; NaN where it fails."""
+        uncertain = tuple(label for label in model.reads if here[label][1] is not None)
+        if (model, uncertain) not in self._functions:
+            function = model.function_for(uncertain)
+            self._functions[model, uncertain] = FlatFunction(function), function
+        evaluate, _ = self._functions[model, uncertain]
+        columns = [here[label][0] for label in model.reads]
+        columns += [covariance for label in uncertain if (covariance := here[label][1]) is not None]
+        results = evaluate([*columns, *(parameter.value.ravel(order="F") for parameter in model.parameters)])
+        n = len(model.writes)
+        return {
+            label: (results[i], results[n + i] if results[n + i].size else None) for i, label in enumerate(model.writes)
+        }
+
+
+def walk(tree: Tree, start: Mapping[str, Moments], selections: dict[str, str], models: ModelNumbers) -> NodeOutcomes:
+    """Compute the outcomes of all nodes, from the root down; unselected branches too, which may be NaN without harm.
 
     Args:
         tree: the unrolled graph.
-        uncertain: the start states that come with a covariance.
+        start: {label: moments} of all actions, selections (one-hot) and given states.
+        selections: {label: choice}.
+        models: evaluates the models.
     """
-
-    def __init__(self, tree: Tree, uncertain: frozenset[str]) -> None:
-        self.tree = tree
-        inputs = Inputs(tree, uncertain)
-        self._layouts: list[_Layout] = []
-        pieces: list[ca.MX] = []
-        length = 0
-
-        def put(piece: ca.MX) -> int:
-            nonlocal length
-            pieces.append(ca.densify(ca.vec(piece)))
-            length += piece.numel()
-            return length - piece.numel()
-
-        waiting: dict[int, tuple[Dictionary, dict[str, tuple[int, int, int]]]] = {}
-        states = {label: g for label, g in inputs.root.items() if label in tree.graph.states()}
-        waiting[0] = inputs.root, {label: self._state(g, put) for label, g in states.items()}
-        for node in tree.nodes:
-            here, layout = waiting.pop(node.index)
-            rewards, shares = [], {}
-            for tree_group in node.groups:
-                model = tree_group.group.probability
-                chances = model.apply(here) if isinstance(model, BoundModel) else {}
-                for tree_branch in tree_group.branches:
-                    model = tree_branch.branch.model
-                    written = model.apply(here) if model is not None else {}
-                    if tree_branch.child is None:
-                        rewards.append(put(written[REWARD].mean))
-                        continue
-                    if chances:
-                        shares[tree_branch.child] = put(chances[tree_branch.branch.label].mean)
-                    new = {label: self._state(g, put) for label, g in written.items()}
-                    waiting[tree_branch.child] = {**here, **written}, {**layout, **new}
-            self._layouts.append(_Layout(layout, tuple(rewards), shares))
-        self._function = FlatFunction(ca.Function("outcomes", inputs.symbols, [ca.vertcat(*pieces)]))
-        # Which start states the expression does not know: given, but written before they are read, or never read.
-        self._root_states = frozenset(states)
-
-    @staticmethod
-    def _state(gaussian: Gaussian, put: object) -> tuple[int, int, int]:
-        exact = gaussian.covariance.nnz() == 0
-        return put(gaussian.mean), -1 if exact else put(gaussian.covariance), gaussian.mean.numel()  # type: ignore[operator]
-
-    def __call__(
-        self, columns: Sequence[Array], selections: Mapping[str, str], given: Mapping[str, Gaussian]
-    ) -> NodeOutcomes:
-        """Evaluate the outcomes.
-
-        Args:
-            columns: the objective's inputs in their order, each flat.
-            selections: {label: choice}.
-            given: all start states, those too that nothing reads.
-        """
-        flat = self._function(columns)[0]
-        extra = {label: gaussian for label, gaussian in given.items() if label not in self._root_states}
-        return NodeOutcomes(self.tree, tuple(self._layouts), flat, dict(selections), extra)
+    count = len(tree.nodes)
+    dictionaries: list[Mapping[str, Moments]] = [start] * count
+    rewards, shares = np.zeros(count), np.ones(count)
+    for node in tree.nodes:
+        here = dictionaries[node.index]
+        for group in node.groups:
+            probability = group.group.probability
+            chances = models(probability, here) if isinstance(probability, BoundModel) else {}
+            for branch in group.branches:
+                model = branch.branch.model
+                written = models(model, here) if model is not None else {}
+                if branch.child is None:
+                    rewards[node.index] += written[REWARD][0][0]
+                    continue
+                dictionaries[branch.child] = {**here, **written} if written else here
+                if group.group.kind == "choose":
+                    shares[branch.child] = float(branch.branch.label == selections[str(group.group.selection)])
+                elif chances:
+                    shares[branch.child] = chances[branch.branch.label][0][0]
+                elif branch.share is not None:
+                    shares[branch.child] = branch.share
+    return NodeOutcomes(tree, dictionaries, rewards, shares)
 
 
 class NodeOutcomes(Sequence[NodeOutcome]):
-    """The outcomes of all tree nodes in tree order; each is put together when it is looked at."""
+    """The outcomes of all tree nodes in tree order; each is put together when it is looked at.
 
-    def __init__(
-        self,
-        tree: Tree,
-        layouts: tuple[_Layout, ...],
-        flat: Array,
-        selections: dict[str, str],
-        extra: dict[str, Gaussian],
-    ) -> None:
+    Attributes:
+        tree: whose nodes they are of.
+        shares: (nodes,) probability of each node given its parent.
+    """
+
+    def __init__(self, tree: Tree, dictionaries: list[Mapping[str, Moments]], rewards: Array, shares: Array) -> None:
         self.tree = tree
-        self._layouts = layouts
-        self._flat = flat
-        self._selections = selections
-        self._extra = extra
+        self.shares = shares
+        self._dictionaries = dictionaries
+        self._rewards = rewards
 
     def __len__(self) -> int:
-        return len(self._layouts)
+        return len(self._dictionaries)
 
     def __getitem__(self, index):  # type: ignore[no-untyped-def]  # as in Sequence: int → outcome, slice → list
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         node = self.tree.nodes[range(len(self))[index]]
-        layout = self._layouts[node.index]
-        states = {**self._extra, **{label: self._gaussian(*where) for label, where in layout.states.items()}}
-        order = self.tree.graph.states()
+        here = self._dictionaries[node.index]
         return NodeOutcome(
             path=self.tree.path(node.index),
             node=node.name,
             probability=float(self.probabilities[node.index]),
-            states={label: states[label] for label in order if label in states},
-            reward=self._reward(node.index),
+            states={label: _gaussian(here[label]) for label in self.tree.graph.states() if label in here},
+            reward=float(self._rewards[node.index]),
             value=float(self._values[node.index]),
             cut=node.cut,
         )
@@ -161,24 +139,6 @@ class NodeOutcomes(Sequence[NodeOutcome]):
         return f"<outcomes of {len(self)} nodes>"
 
     @cached_property
-    def shares(self) -> Array:
-        """(nodes,) probability of each node given its parent."""
-        shares = np.ones(len(self))
-        for node in self.tree.nodes:
-            for tree_group in node.groups:
-                for branch in tree_group.branches:
-                    if branch.child is None:
-                        continue
-                    if tree_group.group.kind == "choose":
-                        chosen = self._selections[str(tree_group.group.selection)]
-                        shares[branch.child] = float(branch.branch.label == chosen)
-                    elif branch.child in self._layouts[node.index].shares:
-                        shares[branch.child] = self._flat[self._layouts[node.index].shares[branch.child]]
-                    elif branch.share is not None:
-                        shares[branch.child] = branch.share
-        return shares
-
-    @cached_property
     def probabilities(self) -> Array:
         """(nodes,) probability of getting to each node."""
         reach = np.ones(len(self))
@@ -191,7 +151,7 @@ class NodeOutcomes(Sequence[NodeOutcome]):
     def _values(self) -> Array:
         values = np.zeros(len(self))
         for node in reversed(self.tree.nodes):
-            values[node.index] += self.tree.cut_value if node.cut else self._reward(node.index)
+            values[node.index] += self.tree.cut_value if node.cut else self._rewards[node.index]
             if node.parent is not None and self.shares[node.index]:
                 values[node.parent] += self.shares[node.index] * values[node.index]
         return values
@@ -207,14 +167,6 @@ class NodeOutcomes(Sequence[NodeOutcome]):
                 escape *= 1.0 - sum(self.shares[child] * cut[child] for child in children)
             cut[node.index] = 1.0 - escape
         return float(cut[0])
-
-    def _reward(self, index: int) -> float:
-        return float(sum(self._flat[offset] for offset in self._layouts[index].rewards))
-
-    def _gaussian(self, mean: int, covariance: int, n: int) -> Gaussian:
-        m = self._flat[mean : mean + n]
-        s = np.zeros((n, n)) if covariance < 0 else self._flat[covariance : covariance + n * n].reshape(n, n, order="F")
-        return unchecked_gaussian(m, s)
 
     def notes(self) -> list[str]:
         """Say what makes the numbers less than they seem: probabilities that do not sum to 1, paths that are cut."""
@@ -242,3 +194,9 @@ class NodeOutcomes(Sequence[NodeOutcome]):
                 f"as {self.tree.cut_value:g} from there (unroll with more max_visits, or another cut_value)"
             )
         return found
+
+
+def _gaussian(moments: Moments) -> Gaussian:
+    mean, covariance = moments
+    n = mean.size
+    return unchecked_gaussian(mean, np.zeros((n, n)) if covariance is None else covariance.reshape(n, n, order="F"))

@@ -13,6 +13,7 @@ from symgraph.drawing import Diagram
 from symgraph.errors import GraphError
 from symgraph.outcomes import NodeOutcome, NodeOutcomes
 from symgraph.slots import Gaussian
+from symgraph.tree import MOST_SHOWN
 
 SHOWN_NODES = 12  # nodes that a printed plan lists
 
@@ -27,7 +28,7 @@ class PlanRun:
         actions: {label: value} at the end [unit].
         value: expected reward at the end; -inf where nothing finite was met.
         outcome: "converged", "iteration limit", "oscillation", "stalled" (no step gains any more), "not finite",
-            "worker died" or "interrupted".
+            or "worker died".
         gradients: gradient evaluations.
         history: the values on the way.
     """
@@ -55,7 +56,7 @@ class Plan:
         runs: a row per start point.
         optimizer: what found it.
         seed: of all that was random.
-        seconds: wall time of the search [s].
+        seconds: wall time, building and compiling at first use included [s].
         units: {label: unit} of the actions and states that have one.
     """
 
@@ -151,7 +152,8 @@ class Plan:
         return self.nodes.tree.diagram(notes, reach, shares)
 
     def _repr_svg_(self) -> str | None:
-        return self.diagram().svg() if isinstance(self.nodes, NodeOutcomes) else None
+        drawn = isinstance(self.nodes, NodeOutcomes) and len(self.nodes) <= MOST_SHOWN
+        return self.diagram().svg() if drawn else None
 
 
 def _plain(value: Any) -> Any:

@@ -67,15 +67,14 @@ def solve(
             raise KeyboardInterrupt
         raise SolveError(_why_not_finite(objective, situation, search))
     selections = _selections(objective, best)
-    columns = [best.point, objective.one_hot(selections), *situation.shared]
-    nodes = situation.build.outcomes(columns, selections, situation.given)
+    nodes = objective.outcomes_of(situation, best.point, selections)
     planned_or_seen: dict[str, Action | State] = {**objective.graph.actions(), **objective.graph.states()}
     return Plan(
         actions=objective.unstack(best.point),
         selections=selections,
         value=best.value,
         status=f"interrupted: best of {len(search.runs)} runs" if search.interrupted else search.status,
-        notes=tuple(nodes.notes()),
+        notes=(*_held_outside(objective, fixed or {}), *nodes.notes()),
         nodes=nodes,
         runs=_Runs(objective, search.runs),
         optimizer=type(optimizer).__name__,
@@ -115,6 +114,18 @@ def _problem(
         guesses=tuple(_guess(objective, one, allowed) for one in _listed(guess)),
         progress=progress,
     )
+
+
+def _held_outside(objective: Objective, fixed: Mapping[str, Any]) -> list[str]:
+    """Say which actions are held outside their bounds."""
+    actions = objective.graph.actions()
+    notes = []
+    for label in fixed:
+        if label in actions:
+            column = np.ravel(fixed[label])
+            if (column < actions[label].lower).any() or (column > actions[label].upper).any():
+                notes.append(f"{label!r} is held at {fixed[label]!r}, outside its bounds")
+    return notes
 
 
 def _listed(guess: Guess | Sequence[Guess] | None) -> list[Guess]:
@@ -170,9 +181,8 @@ def _why_not_finite(objective: Objective, situation: Situation, search: Search) 
         return f"no start point was finished: {search.status}; {died} runs were lost with their worker processes"
     run = search.runs[0]
     selections = _selections(objective, run)
-    columns = [run.start, objective.one_hot(selections), *situation.shared]
     at = f"at actions {objective.unstack(run.start)}, selections {selections}"
-    for node in situation.build.outcomes(columns, selections, situation.given):
+    for node in objective.outcomes_of(situation, run.start, selections):
         if not node.probability:
             continue
         for label, gaussian in node.states.items():

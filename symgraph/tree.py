@@ -15,6 +15,7 @@ from symgraph.errors import GraphError, did_you_mean, names
 from symgraph.graph import Branch, Graph, Group, edge_label
 from symgraph.slots import State
 
+MOST_SHOWN = 300  # nodes that a notebook draws unasked; more take long and nobody can read them
 MAX_NODES = 1_000_000  # beyond it memory runs out before the user learns why
 
 
@@ -137,8 +138,8 @@ class Tree:
                     edges.append(DiagramEdge(key, target, label, g, group.group.kind, muted, weight))
         return Diagram(nodes=tuple(nodes), edges=tuple(edges))
 
-    def _repr_svg_(self) -> str:
-        return self.diagram().svg()
+    def _repr_svg_(self) -> str | None:
+        return self.diagram().svg() if len(self.nodes) <= MOST_SHOWN else None
 
     def __repr__(self) -> str:
         cuts = sum(node.cut for node in self.nodes)

@@ -19,6 +19,7 @@ ARMIJO = 1e-4
 SMALLEST_GAIN = 1e-15
 MOST_PAIRS = 8
 CURVATURE = 0.9
+LOOSE = 1e3
 MOST_ROUNDS = 10
 MOST_TRIES = 50
 
@@ -44,7 +45,10 @@ class FlatFunction:
         with self._lock:  # the buffers are one set for all threads
             for kept, column in zip(self._inputs, columns, strict=True):
                 kept[:] = column
-            self._evaluate()
+            try:
+                self._evaluate()
+            except RuntimeError:  # a model that calls solvers or Python failed at this point
+                return [np.full_like(column, np.nan) for column in self._outputs]
             return [column.copy() for column in self._outputs]
 
     def __reduce__(self) -> tuple[type[FlatFunction], tuple[ca.Function]]:
@@ -91,8 +95,8 @@ class _BoundInterpreted(BoundKernel):
         pairs: list[tuple[Array, Array]] = []  # (step, gradient change), newest last
         most = min(max(len(u), 1), MOST_PAIRS)
         history, outcome = [-f], "iteration limit"
-        fresh, flat, tries = True, 0, 0
-        d, descent, longest = np.zeros_like(u), 0.0, 0.0
+        fresh, flat, tries, doubted = True, 0, 0, False
+        d, descent, longest, slope = np.zeros_like(u), 0.0, 0.0, 0.0
         t, t_low, t_high = 1.0, 0.0, np.inf  # steps between which the line search looks
         f_low, u_low, g_low = f, u, g
         while True:
@@ -136,20 +140,26 @@ class _BoundInterpreted(BoundKernel):
                     if tries > MOST_TRIES or np.abs(trial - u).max() <= 1e-16:
                         accepted = t_low > 0.0
                         if not accepted:  # no step gains; if the pairs are to blame, the gradient alone still will
-                            outcome = outcome if pairs else "stalled"
+                            if not pairs:
+                                outcome = "converged" if doubted or slope <= LOOSE * tolerance else "stalled"
                             pairs, fresh = [], True
             if accepted:
                 step, change = u_low - u, g_low - g
                 if step @ change > 1e-12 * np.sqrt((step @ step) * (change @ change)):
                     pairs = [*pairs, (step, change)][-most:]
-                # Gains lost in rounding mean that it has arrived, but not if the step had to be cut down for them.
-                flat = flat + 1 if f - f_low <= noise and tries == 1 else 0
+                if f - f_low > noise:
+                    flat, doubted = 0, False
+                elif tries == 1 or doubted:
+                    flat += 1
                 u, f, g, fresh = u_low, f_low, g_low, True
             if len(history) >= iterations:
                 break
             history.append(-(min(f, f_low) if t_low > 0.0 and not accepted else f))
-            if flat >= 2:
+            # Gains lost in rounding mean that it has arrived, if the gradient alone, without pairs, gains no more.
+            if doubted and flat >= 1:
                 outcome = "converged"
+            if flat >= 2:
+                flat, doubted, pairs = 0, True, []
             if outcome != "iteration limit":
                 break
         return Ended(place(u), -f, cast(Outcome, outcome), np.array(history))
@@ -215,7 +225,8 @@ def _two_loop(pairs: list[tuple[Array, Array]], gradient: Array, mask: Array) ->
     kept = []
     for s, y in reversed(pairs):
         sy = float((s * mask) @ y)
-        rho = 1.0 / sy if sy > 0.0 else 0.0
+        used = sy > 1e-12 * np.sqrt(float((s * mask) @ s) * float((y * mask) @ y))
+        rho = 1.0 / sy if used else 0.0
         alpha = rho * float((s * mask) @ d)
         d = d - alpha * mask * y
         kept.append((s, y, rho, alpha))

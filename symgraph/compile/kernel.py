@@ -9,7 +9,7 @@ from typing import Literal
 
 from symgraph.slots import Array
 
-Outcome = Literal["converged", "iteration limit", "oscillation", "stalled", "not finite", "worker died", "interrupted"]
+Outcome = Literal["converged", "iteration limit", "oscillation", "stalled", "not finite", "worker died"]
 
 
 @dataclass(frozen=True)

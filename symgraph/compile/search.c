@@ -17,6 +17,7 @@ static const double FIRST_STEP = 0.05;     /* [range] no curvature is known yet 
 static const double LONGEST_STEP = 0.5;    /* [range] no step crosses more than half of it */
 static const double ARMIJO = 1e-4;         /* sufficient decrease: Nocedal & Wright 2006, equation 3.4 */
 static const double CURVATURE = 0.9;       /* how much flatter a step must end: equation 3.6b there */
+static const double LOOSE = 1e3;           /* times the tolerance: converged where rounding hides all further gain */
 static const int MOST_ROUNDS = 10;         /* of sending actions to their bounds */
 static const int MOST_TRIES = 50;          /* steps of one line search */
 static const double SMALLEST_GAIN = 1e-15; /* relative to the value: less cannot be told from rounding */
@@ -74,7 +75,7 @@ static void quasi_newton(const struct pairs *pairs, const double *g, const doubl
   for (k = 0; k < pairs->stored; ++k) {
     const double *s = pairs->s + nth(pairs, k), *y = pairs->y + nth(pairs, k);
     double sy = dot(s, y, mask);
-    rho[k] = sy > 0 ? 1 / sy : 0;
+    rho[k] = sy > 1e-12 * sqrt(dot(s, s, mask) * dot(y, y, mask)) ? 1 / sy : 0;
     alpha[k] = rho[k] * dot(s, d, mask);
     for (i = 0; i < N_ACTIONS; ++i) d[i] -= alpha[k] * mask[i] * y[i];
   }
@@ -95,8 +96,9 @@ static void quasi_newton(const struct pairs *pairs, const double *g, const doubl
 
 /* The same, but actions that it would carry past a bound go to that bound, and the others do without them: clipping the
    step afterwards can leave no descent (Bertsekas 1982). The mask loses those actions. Returns the slope along d. */
-static double direction(const struct pairs *pairs, const double *u, const double *g, double *mask, double *d) {
-  double slope = 0, to_bound[N_ACTIONS + 1];
+static double direction(const struct pairs *pairs, const double *u, const double *g, double *mask, double *d,
+                        double *to_bound) {
+  double slope = 0;
   int i, hits = 1, rounds;
   for (i = 0; i < N_ACTIONS; ++i) to_bound[i] = 0;
   for (rounds = 0; rounds < MOST_ROUNDS && hits; ++rounds) {
@@ -127,10 +129,10 @@ static long long climb(double *x, const struct inputs *in, const double *low, co
   double *u = work + 2 * PAIRS * N_ACTIONS, *g = u + N_ACTIONS, *d = g + N_ACTIONS, *trial = d + N_ACTIONS, *g_trial = trial + N_ACTIONS;
   double *u_low = g_trial + N_ACTIONS, *g_low = u_low + N_ACTIONS, *mask = g_low + N_ACTIONS, *step = mask + N_ACTIONS;
   double *change = step + N_ACTIONS, *free = change + N_ACTIONS;
-  double f = 0, f_low = 0, f_trial = 0, descent = 0, longest = 0;
+  double f = 0, f_low = 0, f_trial = 0, descent = 0, longest = 0, slope = 0;
   double t = 1, t_low = 0, t_high = INFINITY; /* steps between which the line search looks */
   long long spent = 1;
-  int i, fresh = 1, flat = 0, tries = 0;
+  int i, fresh = 1, flat = 0, tries = 0, doubted = 0;
 
   for (i = 0; i < N_ACTIONS; ++i) u[i] = high[i] > low[i] ? fmin(fmax((x[i] - low[i]) / (high[i] - low[i]), 0), 1) : 0;
   if (!descend_value(u, in, low, high, x, &f, g)) {
@@ -144,7 +146,7 @@ static long long climb(double *x, const struct inputs *in, const double *low, co
     double predicted = 0, slope_trial = 0, noise = SMALLEST_GAIN * fabs(f);
     int finite, gained, accepted = 0;
     if (fresh) {
-      double slope = 0;
+      slope = 0;
       for (i = 0; i < N_ACTIONS; ++i) {
         int held = high[i] <= low[i] || (u[i] <= 0 && g[i] > 0) || (u[i] >= 1 && g[i] < 0);
         mask[i] = held ? 0 : 1;
@@ -155,7 +157,7 @@ static long long climb(double *x, const struct inputs *in, const double *low, co
         break;
       }
       for (i = 0; i < N_ACTIONS; ++i) free[i] = mask[i];
-      descent = direction(&pairs, u, g, mask, d);
+      descent = direction(&pairs, u, g, mask, d, change);
       if (pairs.stored == 0 || !(descent < 0)) { /* nothing known of the curvature: along the gradient */
         descent = 0;
         for (i = 0; i < N_ACTIONS; ++i) {
@@ -206,7 +208,7 @@ static long long climb(double *x, const struct inputs *in, const double *low, co
           accepted = t_low > 0;
           if (!accepted) {
             /* No step gains any more. If the curvature pairs are to blame, the gradient alone will still gain. */
-            if (pairs.stored == 0) *outcome = STALLED;
+            if (pairs.stored == 0) *outcome = doubted || slope <= LOOSE * tolerance ? CONVERGED : STALLED;
             fresh = 1;
           }
         }
@@ -229,8 +231,8 @@ static long long climb(double *x, const struct inputs *in, const double *low, co
           pairs.y[nth(&pairs, 0) + i] = change[i];
         }
       }
-      /* Gains lost in rounding mean that it has arrived, but not if the step had to be cut down for them. */
-      flat = f - f_low <= noise && tries == 1 ? flat + 1 : 0;
+      if (f - f_low > noise) flat = doubted = 0;
+      else if (tries == 1 || doubted) ++flat;
       f = f_low;
       for (i = 0; i < N_ACTIONS; ++i) {
         u[i] = u_low[i];
@@ -242,7 +244,13 @@ static long long climb(double *x, const struct inputs *in, const double *low, co
     }
     if (spent >= iterations) break;
     history[spent++] = -(t_low > 0 && !accepted ? fmin(f, f_low) : f);
-    if (flat >= 2) *outcome = CONVERGED;
+    /* Gains lost in rounding mean that it has arrived, if the gradient alone, without curvature pairs, gains no more. */
+    if (doubted && flat >= 1) *outcome = CONVERGED;
+    if (flat >= 2) {
+      doubted = 1;
+      flat = 0;
+      pairs.stored = 0;
+    }
     if (*outcome != ITERATION_LIMIT) break;
   }
   place(u, low, high, x);

@@ -11,13 +11,15 @@ import numpy as np
 
 from symgraph.compile.kernel import AdadeltaSteps, BoundKernel, Ended
 from symgraph.errors import InputError
-from symgraph.optimizers.lbfgs import climbed, number, positive_whole, status_of
-from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
+from symgraph.optimizers.problem import Choices, Optimizer, Problem, Run, Search, best_of
+from symgraph.optimizers.settings import number, positive_whole
+from symgraph.optimizers.starts import climbed, promising_points, status_of
 from symgraph.slots import Array
 
 RUNS_PER_TASK = 4  # runs that a worker process is handed at once
 MAX_DEATHS = 2  # workers that may die before the search ends with what it has
 SMALLEST_EPSILON = 1e-300  # 0 would keep every point where it is
+SAMPLES_PER_COMBINATION = 8
 POLISHED = 2  # best runs of each combination of selections that are polished
 POLISH_ITERATIONS = 200
 
@@ -143,13 +145,13 @@ class Adadelta(Optimizer):
         if self.polish and not interrupted:
             polished, interrupted = self._polished(problem, ended)
             ended += polished
-        status = status_of(problem, ended, queue.starts)
+        status = status_of(problem, ended, len({run.start.tobytes() + run.choices.tobytes() for run in ended}))
         if deaths > MAX_DEATHS:
             status = f"best of {len(ended)} runs: given up, because worker processes died again and again"
         return Search(ended, status, interrupted)
 
-    def _steps(self, problem: Problem) -> AdadeltaSteps:
-        scale = problem.scale if self.scaled else 1.0
+    def _steps(self, problem: Problem, choice: Choices) -> AdadeltaSteps:
+        scale = problem.scale(choice) if self.scaled else 1.0
         numbers = self.decay, self.epsilon, self.tolerance * scale
         return AdadeltaSteps(*numbers, scale, self.oscillation, self.scaled, self.keep_best)
 
@@ -179,8 +181,11 @@ class _Queue:
         self._problem = problem
         self._rng = rng
         count = settings.starts + (len(problem.allowed) if settings.start_per_selection else 0)
-        choices = problem.draw_choices(rng, count, settings.evenly)
-        points = problem.draw_points(rng, count, settings.sampling)
+        if settings.evenly and problem.combinations > count:  # only the most promising have a start
+            points, choices = promising_points(problem, rng, count, SAMPLES_PER_COMBINATION)
+        else:
+            choices = problem.draw_choices(rng, count, settings.evenly)
+            points = problem.draw_points(rng, count, settings.sampling)
         if problem.guesses:
             guessed, guessed_choices = problem.started_from_guesses(rng)
             points, choices = np.concatenate([guessed, points]), np.concatenate([guessed_choices, choices])
@@ -215,9 +220,9 @@ class _Queue:
         return Run(point, point, best.choices, -np.inf, "iteration limit", np.zeros(0))
 
 
-def _move(kernel: BoundKernel, points: Array, hot: Array, limit: int, steps: AdadeltaSteps) -> list[Ended]:
+def _move(kernel: BoundKernel, points: Array, hot: Array, limit: int, steps: list[AdadeltaSteps]) -> list[Ended]:
     """Move points (P, n) one after the other; at the top level so that worker processes find it."""
-    return [kernel.ascend(point, one_hot, limit, steps) for point, one_hot in zip(points, hot, strict=True)]
+    return [kernel.ascend(p, h, limit, s) for p, h, s in zip(points, hot, steps, strict=True)]
 
 
 @contextmanager
@@ -244,7 +249,8 @@ def _movers(processes: int) -> Iterator[Callable[[Adadelta, Problem, list[Run], 
 
 def _task(settings: Adadelta, problem: Problem, batch: list[Run], limit: int) -> tuple[Any, ...]:
     points, choices = np.array([run.point for run in batch]), np.array([run.choices for run in batch])
-    return problem.kernel, points, problem.one_hot(choices), limit, settings._steps(problem)
+    steps = [settings._steps(problem, run.choices) for run in batch]
+    return problem.kernel, points, problem.one_hot(choices), limit, steps
 
 
 def _joined(batch: list[Run], ended: list[Ended]) -> list[Run]:

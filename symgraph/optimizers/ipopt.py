@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from types import FrameType
 from typing import Any
 
 import casadi as ca
@@ -14,8 +15,9 @@ import numpy as np
 
 from symgraph.compile.kernel import Outcome
 from symgraph.objective import Build
-from symgraph.optimizers.lbfgs import number, positive_whole, promising_points
 from symgraph.optimizers.problem import Choices, Optimizer, Problem, Run, Search
+from symgraph.optimizers.settings import number, positive_whole
+from symgraph.optimizers.starts import promising_points
 from symgraph.slots import Array
 
 SMALLEST_TOLERANCE = 1e-15  # IPOPT refuses 0
@@ -81,7 +83,8 @@ class Ipopt(Optimizer):
         if problem.n == 0:
             return Run(point, point, choice, start_value, "converged", np.array([start_value]))
         solver = self._solver(problem.situation.build, interrupted)
-        parameters = np.concatenate([hot[0], *problem.situation.shared, [problem.scale]])
+        scale = problem.scale(choice)
+        parameters = np.concatenate([hot[0], *problem.situation.shared, [scale]])
         found = solver(x0=point, lbx=problem.low, ubx=problem.high, p=parameters)
         statistics = solver.stats()
         status = str(statistics["return_status"])
@@ -89,13 +92,14 @@ class Ipopt(Optimizer):
         value = float(problem.values(end[None], choice[None])[0])
         if not value >= start_value:  # not finite half-way, or gone astray: the start is the better plan
             end, value = point, start_value
-        objectives = statistics.get("iterations", {}).get("obj", [-start_value / problem.scale])
-        history = -problem.scale * np.array(objectives)
+        objectives = statistics.get("iterations", {}).get("obj", [-start_value / scale])
+        history = -scale * np.array(objectives)
         return Run(point, end, choice, value, _OUTCOMES.get(status, "stalled"), history)
 
     def _solver(self, build: Build, interrupted: list[int]) -> ca.Function:
         """Return IPOPT on −J/scale over the actions; its parameters are the other inputs and the scale, stacked."""
-        if self not in build.kept:
+        key = Ipopt, self.iterations, self.tolerance
+        if key not in build.kept:
             expectation = build.expectation
             actions, *others = expectation.inputs.symbols
             scale = ca.MX.sym("scale")
@@ -109,9 +113,9 @@ class Ipopt(Optimizer):
                 "iteration_callback": watch,
                 "ipopt": {"print_level": 0, "sb": "yes", "max_iter": self.iterations, "tol": self.tolerance},
             }
-            build.kept[self] = ca.nlpsol("ipopt", "ipopt", problem, options), watch
+            build.kept[key] = ca.nlpsol("ipopt", "ipopt", problem, options), watch
         solver: ca.Function
-        solver, watch = build.kept[self]
+        solver, watch = build.kept[key]
         watch.interrupted = interrupted
         return solver
 
@@ -152,8 +156,14 @@ def _interrupts() -> Iterator[list[int]]:
     if threading.current_thread() is not threading.main_thread():  # only that one is interrupted
         yield noted
         return
-    before = signal.signal(signal.SIGINT, lambda number, frame: noted.append(number))
+
+    def note(number: int, frame: FrameType | None) -> None:
+        noted.append(number)
+        if len(noted) > 1:  # the first did not end it
+            raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, note)
     try:
         yield noted
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, signal.default_int_handler if before is None else before)

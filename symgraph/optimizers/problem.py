@@ -6,7 +6,6 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +15,9 @@ from symgraph.objective import Situation
 from symgraph.progress import Progress
 from symgraph.slots import Array
 
-SCALE_SAMPLES = 64
+SCALE_SAMPLES = 32
+FEWEST_SAMPLES = 16
+GUESS_COMBINATIONS = 1024  # of selections that a guess leaves out
 
 Choices = npt.NDArray[np.int64]  # (P, number of selections): which choice of each selection, a row per point
 
@@ -43,6 +44,7 @@ class Problem:
     allowed: tuple[tuple[int, ...], ...]
     guesses: tuple[tuple[Array, Choices], ...] = ()
     progress: Progress = field(default_factory=lambda: Progress("planning", shown=False))
+    _scales: dict[bytes, float] = field(default_factory=dict)
 
     @property
     def n(self) -> int:
@@ -73,21 +75,26 @@ class Problem:
         span = self.high - self.low
         return (points - self.low) / np.where(span > 0.0, span, 1.0)
 
-    @cached_property
-    def scale(self) -> float:
-        """Size of the differences of J that matter here: the middle half of sampled values spans it [reward].
+    def scale(self, choice: Choices) -> float:
+        """Return the size of the differences of J that matter under choices (s,): the spread of samples [reward].
 
-        Tolerances are relative to it, so that scaling the rewards, or adding a constant to them, changes nothing.
+        Tolerances are relative to it, so that scaling the rewards, or adding a constant to them, changes nothing; it is
+        taken for each combination of selections, since those may differ by far more than the actions can change.
         """
-        rng = np.random.default_rng(0)
-        choices = self.draw_choices(rng, SCALE_SAMPLES, evenly=True)
-        values = np.sort(self.values(self.draw_points(rng, SCALE_SAMPLES, "spread"), choices))
-        finite = values[np.isfinite(values)]
-        for share in (4, SCALE_SAMPLES):  # a peak on a plain: then the whole range
-            spread = finite[-1 - len(finite) // share] - finite[len(finite) // share] if len(finite) else 0.0
-            if spread > 0.0:
-                return float(spread)
-        return 1.0
+        if choice.tobytes() not in self._scales:
+            points = self.draw_points(np.random.default_rng(0), SCALE_SAMPLES, "spread")
+            self.remember_scale(choice, self.values(points, np.tile(choice, (SCALE_SAMPLES, 1))))
+        return self._scales.get(choice.tobytes(), 1.0)
+
+    def remember_scale(self, choice: Choices, values: Array) -> None:
+        """Take the scale of choices (s,) from sampled values, if they are enough."""
+        finite = np.sort(values[np.isfinite(values)])
+        n = len(finite)
+        if n < FEWEST_SAMPLES:
+            return
+        # The middle half, or the whole range where there is a peak on a plain.
+        spread = float(finite[-1 - n // 4] - finite[n // 4]) or float(finite[-1] - finite[0])
+        self._scales[choice.tobytes()] = spread or 1.0
 
     def draw_choices(self, rng: np.random.Generator, count: int, evenly: bool) -> Choices:
         """Draw choices (count, s): evenly over the combinations, or independently and uniformly."""
@@ -126,12 +133,18 @@ class Problem:
         return np.clip(self.low + (self.high - self.low) * unit, self.low, self.high)
 
     def started_from_guesses(self, rng: np.random.Generator) -> tuple[Array, Choices]:
-        """Return the guesses as points (P, n) and choices (P, s), what they leave out drawn at random."""
+        """Return the guesses as points (P, n) and choices (P, s).
+
+        Actions that they leave out are drawn at random, selections are those with the best value there.
+        """
         count = len(self.guesses)
-        points, choices = self.draw_points(rng, count, "uniform"), self.draw_choices(rng, count, evenly=False)
+        points, choices = self.draw_points(rng, count, "uniform"), np.zeros((count, len(self.allowed)), dtype=np.int64)
         for i, (point, choice) in enumerate(self.guesses):
             points[i] = np.where(np.isnan(point), points[i], np.clip(point, self.low, self.high))
-            choices[i] = np.where(choice < 0, choices[i], choice)
+            tried = self.draw_choices(rng, min(self.combinations, GUESS_COMBINATIONS), evenly=True)
+            tried = np.unique(np.where(choice < 0, tried, choice), axis=0)
+            values = self.values(np.tile(points[i], (len(tried), 1)), tried) if len(tried) > 1 else np.zeros(1)
+            choices[i] = tried[int(np.argmax(values))]
         return points, choices
 
 
