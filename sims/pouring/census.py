@@ -12,7 +12,7 @@ from sims.pouring.simulation import Simulation
 
 RESTING_SPEED = 0.1  # a sphere in the receiver that is slower has been received
 HANGING_SPEED = 0.02  # a sphere outside that is slower lies on something and flows no more
-HEAP_HEIGHT = 0.25  # spheres resting up to this far above the receiver's rim belong to its heap
+HEAP_HEIGHT = 0.35  # spheres resting up to this far above the receiver's rim belong to its heap
 FAR = (3.0, 2.0)  # spheres beyond this x or y have left the scene for good
 
 
@@ -47,15 +47,7 @@ class Census:
         self.leaked: set[int] = set()
         self._landed = np.zeros(SPHERES, dtype=bool)
         self._landings = np.zeros((SPHERES, 2))
-        self._in_source, self._in_receiver = self._locals(simulation)
-
-    def _locals(self, simulation: Simulation) -> tuple[np.ndarray, np.ndarray]:
-        """(n, 3) positions in the frames of source and receiver."""
-        positions = simulation.positions
-        return (
-            simulation.source.to_local(positions, simulation.pose),
-            simulation.receiver.to_local(positions, simulation.receiver_pose),
-        )
+        self._look(simulation)
 
     def start_trial(self) -> None:
         """Forget where earlier flows came down."""
@@ -68,47 +60,63 @@ class Census:
 
     def update(self, simulation: Simulation) -> None:
         """Classify the spheres after a control step."""
-        source, receiver = simulation.source, simulation.receiver
-        before_source, before_receiver = self._in_source, self._in_receiver
-        in_source_frame, in_receiver_frame = self._locals(simulation)
-        speeds = np.linalg.norm(simulation.velocities, axis=1)
-        height = in_receiver_frame[:, 2]
+        before_source, before_receiver = self._from_source, self._from_receiver
+        was_in_source, was_above = self._in_source, self._above_receiver
+        self._look(simulation)
+        outside = ~self._in_source
+        above = self._above_receiver & outside
+        height = self._from_receiver[:, 2]
+        rim = simulation.receiver.rim
+        top = rim + SPHERE_RADIUS
+        velocities = simulation.velocities
+        speeds = np.sqrt(np.einsum("ij,ij->i", velocities, velocities))
 
-        inside_source = source.contains(in_source_frame)
-        above_receiver = receiver.above(in_receiver_frame) & ~inside_source
-        top = receiver.rim + SPHERE_RADIUS
-        inside_receiver = above_receiver & (height < top)
-        heap = above_receiver & (height < receiver.rim + HEAP_HEIGHT) & (speeds < RESTING_SPEED)
-        far = (np.abs(simulation.positions[:, :2]) > FAR).any(axis=1)
-        on_floor = (~inside_source & ~inside_receiver & (height < 2 * SPHERE_RADIUS)) | far
-        came_out = (self.classes == SphereClass.SOURCE) | (self.classes == SphereClass.FLOWING)
-
+        inside_receiver = above & (height < top)
+        received = above & (height < rim + HEAP_HEIGHT) & (speeds < RESTING_SPEED)
+        on_floor = outside & ~inside_receiver & (height < 2 * SPHERE_RADIUS)
+        on_floor |= (np.abs(simulation.positions[:, :2]) > FAR).any(axis=1)
+        came_out = self.classes <= SphereClass.FLOWING
         classes = np.full(SPHERES, SphereClass.BOUNCED)
         classes[came_out & ~inside_receiver & (speeds > HANGING_SPEED)] = SphereClass.FLOWING
         classes[on_floor] = SphereClass.SPILLED
-        classes[(inside_receiver | heap) & (speeds < RESTING_SPEED)] = SphereClass.RECEIVED
-        was_inside = source.contains(before_source)
-        classes[inside_source] = SphereClass.SOURCE
+        classes[received] = SphereClass.RECEIVED
+        classes[self._in_source] = SphereClass.SOURCE
 
-        sank = ~self._landed & ~inside_source & (before_receiver[:, 2] > top) & (height <= top)
-        self._landings[sank] = in_receiver_frame[sank, :2]
+        sank = outside & ~self._landed & (before_receiver[:, 2] > top) & (height <= top)
+        self._landings[sank] = self._from_receiver[sank, :2]
         self._landed |= sank
-
-        through_source = (was_inside != inside_source) & ~source.through_mouth(before_source, in_source_frame)
-        low = receiver.rim - SPHERE_RADIUS
-        through_receiver = (
-            (receiver.above(before_receiver) != receiver.above(in_receiver_frame))
-            & (before_receiver[:, 2] < low)
-            & (height < low)
-        )
-        self.leaked.update(np.flatnonzero(through_source | through_receiver | (height < 0.0)).tolist())
+        self._find_leaks(simulation, was_in_source, was_above, before_source, before_receiver)
 
         self.classes = classes
-        self.in_source = int(inside_source.sum())
-        self.in_receiver = int((inside_receiver | heap).sum())
+        self.in_source = int(self._in_source.sum())
+        self.in_receiver = int((inside_receiver | received).sum())
         self.spilled = max(self.spilled, int(on_floor.sum()))
         self.flowing = int((classes == SphereClass.FLOWING).sum())
-        self._in_source, self._in_receiver = in_source_frame, in_receiver_frame
+
+    def _look(self, simulation: Simulation) -> None:
+        """Find the spheres in the frames of source and receiver."""
+        self._from_source = simulation.source.to_local(simulation.positions, simulation.pose)
+        self._from_receiver = simulation.receiver.to_local(simulation.positions, simulation.receiver_pose)
+        self._in_source = simulation.source.contains(self._from_source)
+        self._above_receiver = simulation.receiver.above(self._from_receiver)
+
+    def _find_leaks(
+        self,
+        simulation: Simulation,
+        was_in_source: np.ndarray,
+        was_above: np.ndarray,
+        before_source: np.ndarray,
+        before_receiver: np.ndarray,
+    ) -> None:
+        """Note the spheres that changed sides other than through the mouth or over the rim."""
+        passed = np.flatnonzero(was_in_source != self._in_source)
+        if len(passed):
+            proper = simulation.source.through_mouth(before_source[passed], self._from_source[passed])
+            self.leaked.update(passed[~proper].tolist())
+        low = simulation.receiver.rim - SPHERE_RADIUS
+        height = self._from_receiver[:, 2]
+        walled = (was_above != self._above_receiver) & (before_receiver[:, 2] < low) & (height < low)
+        self.leaked.update(np.flatnonzero(walled | (height < 0.0)).tolist())
 
     def copy(self) -> Census:
         """Return an independent copy."""

@@ -33,7 +33,7 @@ SPHERE_MASS = SPHERE_DENSITY * 4 / 3 * math.pi * SPHERE_RADIUS**3
 GRIPPER_SIZE = (0.105, 0.35, 0.1)  # each of two blocks, before and behind the source
 RECEIVER_DENSITY = 5000.0  # heavy: it weighs more than all spheres together
 CONTACT_TIME = 6 * TIME_STEP  # half a period of the undamped contact; from 4 steps down the bounce is left to chance
-ITERATIONS = 30  # of the contact solver, per physics step; with 15, bouncing spheres gain energy
+ITERATIONS = 25  # of the contact solver, per physics step; with 15, bouncing spheres gain energy
 KINEMATIC_INERTIA = 20.0  # so large that the source follows its commands, so small that the solver stays accurate
 
 # Spheres dropped on each other and on walls with these damping ratios came back with these shares of their speed (mean
@@ -62,11 +62,12 @@ def compile_scene(material: Material, source: Source, receiver: Receiver) -> muj
 <mujoco model="pouring">
   <compiler angle="radian" autolimits="true"/>
   <option timestep="{TIME_STEP}" gravity="0 0 {-GRAVITY}" integrator="Euler" solver="CG" cone="elliptic"
-          iterations="{ITERATIONS}" ls_iterations="20" tolerance="1e-8" jacobian="sparse">
-    <flag autoreset="disable"/>
+          iterations="{ITERATIONS}" ls_iterations="8" tolerance="1e-6" jacobian="sparse">
+    <flag autoreset="disable" island="disable"/>
   </option>
   <size memory="64M"/>
-  <visual><global offwidth="1280" offheight="960"/><headlight ambient="0.4 0.4 0.4"/></visual>
+  <visual><global offwidth="1280" offheight="960"/><headlight ambient="0.5 0.5 0.5" diffuse="0.5 0.5 0.5"/></visual>
+  <asset><texture type="skybox" builtin="flat" rgb1="1 1 1" rgb2="1 1 1" width="8" height="48"/></asset>
   <default>
     <geom condim="3" friction="{material.friction} 0.005 0.0001" solref="{-stiffness} {-damping}"
           solimp="0.95 0.99 0.001 0.5 2"/>

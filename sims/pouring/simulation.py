@@ -20,7 +20,7 @@ from sims.pouring.geometry import (
     required_lift,
 )
 from sims.pouring.materials import Material
-from sims.pouring.scene import CONTROL_STEP, SPHERE_MASS, SUBSTEPS, TIME_STEP, compile_scene
+from sims.pouring.scene import SPHERE_MASS, SUBSTEPS, TIME_STEP, compile_scene
 
 SERVO_GAIN = 10.0  # [1 / time]; velocity = gain * (command - pose)
 SPEED_LIMIT = np.array([1.0, 1.0, 2.0])  # of shoulder x, z [length / time] and tilt [rad / time]
@@ -154,13 +154,13 @@ class Simulation:
 
     def _limit_speeds(self) -> None:
         velocities = self.velocities
-        squares = np.einsum("ij,ij->i", velocities, velocities)
-        fastest = squares.max()
+        fastest = np.abs(velocities).max()
         if not np.isfinite(fastest):
             raise SimulationFailed(f"simulation: a sphere's velocity is not finite at time {self.time:.3f}")
-        if fastest > SPHERE_SPEED_LIMIT**2:
-            fast = squares > SPHERE_SPEED_LIMIT**2
-            velocities[fast] *= (SPHERE_SPEED_LIMIT / np.sqrt(squares[fast]))[:, None]
+        if fastest > SPHERE_SPEED_LIMIT / 2:  # the largest component of too fast a sphere exceeds limit / sqrt(3)
+            speeds = np.linalg.norm(velocities, axis=1)
+            fast = speeds > SPHERE_SPEED_LIMIT
+            velocities[fast] *= (SPHERE_SPEED_LIMIT / speeds[fast])[:, None]
             self.slowed += int(fast.sum())
 
     def save(self) -> SimulationState:
