@@ -26,11 +26,16 @@ class Bounds:
     high: tuple[float, ...]
     unit: str
 
+    def scale(self, shares: ArrayLike) -> np.ndarray:
+        """Return the values at shares of the range, 0 for the lowest and 1 for the highest."""
+        low = np.array(self.low)
+        return low + np.asarray(shares, dtype=float) * (np.array(self.high) - low)
+
 
 ACTIONS = {
     "grasp_ratio": Bounds((0.0,), (1.0,), "share of the source's height"),
-    # x of the shoulder relative to the receiver's centre, z above the floor. Lower, the lip would press spheres on the
-    # rim; further back, everything falls short.
+    # x of the shoulder relative to the receiver's centre, z above the floor. Lower, the lip would press
+    # spheres on the rim; further back, everything falls short.
     "pour_position": Bounds((-0.35, 0.32), (0.0, 0.55), "length"),
     "tilt_rate": Bounds((0.01,), (0.02,), "rad / control step"),
     "search_rate": Bounds((0.002,), (0.005,), "rad / control step"),
@@ -44,7 +49,8 @@ class Clamp:
     """A command that could not be followed as it was given.
 
     Args:
-        label: Of the action, or "lift" if the source had to be raised to clear the receiver's rim, heap or the floor.
+        label: Of the action, or "lift" if the source had to be raised to clear the receiver's rim, heap or
+            the floor.
         asked: The value that was given; 0 for a lift.
         used: What was done instead.
     """
@@ -71,7 +77,9 @@ def read_action(node: str, actions: Mapping[str, ArrayLike], label: str, clamps:
     bounds = ACTIONS[label]
     value = np.atleast_1d(np.asarray(actions[label], dtype=float))
     if value.shape != (len(bounds.low),):
-        raise ValueError(f"node {node!r}: action {label!r} has shape {value.shape}; give {len(bounds.low)} number(s)")
+        raise ValueError(
+            f"node {node!r}: action {label!r} has shape {value.shape}; give {len(bounds.low)} number(s)"
+        )
     if not np.isfinite(value).all():
         raise ValueError(f"node {node!r}: action {label!r} is {value.tolist()}; give finite numbers")
     used = np.clip(value, bounds.low, bounds.high)

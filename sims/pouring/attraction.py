@@ -7,15 +7,18 @@ import numpy as np
 from sims.pouring.geometry import SPHERE_RADIUS
 from sims.pouring.materials import Material
 
-_REFERENCE_MASS = 4 / 3 * np.pi * SPHERE_RADIUS**3  # a sphere of density 1, for which the constants K are given
-_CLOSEST = SPHERE_RADIUS**2  # squared distance below which overlapping spheres attract each other no more strongly
+# The constants K are given for spheres of density 1.
+_REFERENCE_MASS = 4 / 3 * np.pi * SPHERE_RADIUS**3
+# Squared distance below which overlapping spheres attract each other no more strongly.
+_CLOSEST = SPHERE_RADIUS**2
 
 
 class Attraction:
     """Accelerations by a_i = k sum_j (x_j - x_i) / |x_j - x_i|^2 over the spheres j within reach.
 
-    It is evaluated once per command and held over the physics steps in between, as in the published simulator, whose
-    step was that long. That, and working in place on whole matrices, keeps it below a tenth of the time of a step.
+    It is evaluated once per command and held over the physics steps in between, as in the published
+    simulator, whose step was that long. That, and working in place on whole matrices, keeps it below a tenth
+    of the time of a step.
 
     Args:
         material: Attraction constant and reach.

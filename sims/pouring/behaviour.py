@@ -15,13 +15,18 @@ from sims.pouring.scene import CONTROL_STEP
 from sims.pouring.simulation import Simulation, SimulationState
 from sims.pouring.skills import Move, Shake, Tip
 
-WAYPOINT = (-0.3, 0.35)  # shoulder's x from the receiver's centre and z above its rim before and after a trial
+WAYPOINT = (
+    -0.3,
+    0.35,
+)  # shoulder's x from the receiver's centre and z above its rim before and after a trial
 CARRY_TILT = math.pi / 4
 POUR_TILT = math.pi / 3  # before and after a flow; at 45 degrees a low source would stand on the floor
 CARRY_SPEED = 0.3  # to the receiver and back to the waypoint [length / time]
 APPROACH_SPEED = 0.1  # to the pouring position [length / time]
 CARRY_TILT_SPEED = 0.8  # [rad / time]
-RETURN_TILT_SPEED = 1.6  # after a flow [rad / time]; what is still to come falls until the source has turned back
+RETURN_TILT_SPEED = (
+    1.6  # after a flow [rad / time]; what is still to come falls until the source has turned back
+)
 ARRIVED = 0.005  # distance to the goal, in length and rad, at which a move ends
 
 SPHERE_AMOUNT = 0.0055  # amount of one sphere, poured or let out
@@ -140,7 +145,9 @@ class Behaviour:
     @property
     def waypoint(self) -> np.ndarray:
         """(2,) x and z of the shoulder before and after a trial."""
-        return np.array([self.simulation.receiver_pose[0] + WAYPOINT[0], self.simulation.receiver.rim + WAYPOINT[1]])
+        return np.array(
+            [self.simulation.receiver_pose[0] + WAYPOINT[0], self.simulation.receiver.rim + WAYPOINT[1]]
+        )
 
     def grasp(self, ratio: float) -> float:
         """Hold the source at a share of its height; return the height of the grasp [length]."""
@@ -226,7 +233,9 @@ class Behaviour:
             rested = rested + 1 if fastest < REST_SPEED else 0
         self.trial.stopped = "no flow" if skill.ended else stopped
         self.trial.duration = simulation.time - begin
-        self.trial.mouth = simulation.source.mouth_centre(simulation.pose) - float(simulation.receiver_pose[0])
+        self.trial.mouth = simulation.source.mouth_centre(simulation.pose) - float(
+            simulation.receiver_pose[0]
+        )
         tilted = np.array([*place[:2], simulation.command[2]])
         back = Move(tilted, place, CARRY_SPEED, RETURN_TILT_SPEED)
         while not back.ended or simulation.distance_to_goal > ARRIVED:

@@ -55,7 +55,7 @@ class Census:
 
     @property
     def landings(self) -> np.ndarray:
-        """(k, 2) x and y, relative to the receiver, at which the trial's spheres first sank to the rim's height."""
+        """(k, 2) x and y in the receiver's frame where the trial's spheres first sank to its rim."""
         return self._landings[self._landed]
 
     def update(self, simulation: Simulation) -> None:

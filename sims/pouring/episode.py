@@ -27,7 +27,7 @@ class Episode:
         seed: With which the world was reset.
         steps: (node reached, what was observed on the way there), from "start" on.
         stops: Why the skill stopped, trial by trial.
-        end: Why the episode was over; None if it was left after the given number of trials.
+        end: Why the episode was over; None if it was left although it could have gone on.
         metrics: Counts at the end.
         clamps: Commands that could not be followed as given.
     """
@@ -40,7 +40,13 @@ class Episode:
     clamps: list[Clamp] = field(default_factory=list)
 
 
-def run_episode(world: PouringWorld, policy: Policy, seed: int, trials: int | None = None) -> Episode:
+def run_episode(
+    world: PouringWorld,
+    policy: Policy,
+    seed: int,
+    trials: int | None = None,
+    begin: Callable[[PouringWorld], None] | None = None,
+) -> Episode:
     """Run an episode to its end.
 
     Args:
@@ -48,25 +54,28 @@ def run_episode(world: PouringWorld, policy: Policy, seed: int, trials: int | No
         policy: (node, all that is known) -> (actions, selections).
         seed: Of the episode.
         trials: After how many to leave; None goes on until the episode is over.
+        begin: Called after the reset, to attach a camera or a viewer to the episode.
 
     Returns:
         What happened; a failed simulation ends the episode as End.FAILED with what was measured.
     """
     episode = Episode(seed)
     known = world.reset(seed)
+    if begin is not None:
+        begin(world)
     episode.steps.append(("start", dict(known)))
-    while world.end is None and (trials is None or len(episode.stops) < trials or world.node != "poured"):
+    while world.end is None and len(episode.stops) != trials:
         actions, selections = policy(world.node, known)
         try:
             reached = world.execute(world.node, actions, selections)
         except SimulationFailed as failure:
             reached = {"failed": failure.observed}
-        for node, observed in reached.items():
+        episode.steps.extend(reached.items())
+        for observed in reached.values():
             known = {**known, **observed}
-            episode.steps.append((node, observed))
-        if world.node == "poured" and world.end is None and "poured" in reached:
+        if "poured" in reached:
             episode.stops.append(world.behaviour.trial.stopped)
-    episode.end = world.end or (world.behaviour.end if world.node == "poured" else None)
+    episode.end = world.end or world.behaviour.end
     episode.metrics, episode.clamps = world.metrics, list(world.clamps)
     return episode
 

@@ -1,8 +1,8 @@
 """Sizes and places: the spheres, the source container with its lip, the receiver.
 
-Lengths are in the simulator's unit (a sphere is 0.05 wide); gravity is 1. The x axis points from the source to the
-receiver, z upwards. The source moves and tilts in the x-z plane; its *shoulder*, the upper edge that faces the
-receiver, is the point that commands and observations speak of.
+Lengths are in the simulator's unit (a sphere is 0.05 wide); gravity is 1. The x axis points from the source
+to the receiver, z upwards. The source moves and tilts in the x-z plane; its *shoulder*, the upper edge that
+faces the receiver, is the point that commands and observations speak of.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SOURCE_WIDTH = 0.3  # outer width in x and y
 SOURCE_HEIGHT = 0.5  # without the lip
 WALL = 0.005  # nominal; the walls that spheres meet grow outwards from their inner face
 INNER = SOURCE_WIDTH / 2 - WALL  # half the inner width
-SOURCE_WALL = 0.05  # outward growth of the source's walls: a sphere would have to pass 0.05 in one step to tunnel
+SOURCE_WALL = 0.05  # outward growth of the source's walls, more than a sphere moves in one step
 LIP_WALL = 0.03
 START = (SOURCE_WIDTH / 2, 0.0, SOURCE_HEIGHT)  # shoulder of the source standing upright at x = 0
 MOUTH_RANGE = (0.11, 0.25)
@@ -57,7 +57,7 @@ class Source:
         return INNER - self.mouth / 2
 
     def to_local(self, points: np.ndarray, pose: np.ndarray) -> np.ndarray:
-        """(n, 3) points in the frame of the box's bottom centre, for the pose (x, z, tilt) of the shoulder."""
+        """(n, 3) points in the frame of the box's bottom centre, for a shoulder at (x, z, tilt)."""
         cos, sin = math.cos(pose[2]), math.sin(pose[2])
         x, z = points[:, 0] - pose[0], points[:, 2] - pose[1]
         return np.stack(
@@ -76,7 +76,7 @@ class Source:
         )
 
     def through_mouth(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """(n,) whether the straight way between two (n, 3) sets of points in the local frame leads through the opening."""
+        """(n,) whether straight ways between (n, 3) points in the local frame lead through the opening."""
         top = SOURCE_HEIGHT + self.lip
         rise = after[:, 2] - before[:, 2]
         crosses = (before[:, 2] < top) != (after[:, 2] < top)
@@ -90,10 +90,19 @@ class Source:
         slope = LIP_WALL * math.sqrt(0.5)
         tip = (INNER - self.lip + slope, top + self.lip + slope)
         corners = np.array(
-            [(-out, WALL - SOURCE_WALL), (out, WALL - SOURCE_WALL), (out, top), tip, (-tip[0], tip[1]), (-out, top)]
+            [
+                (-out, WALL - SOURCE_WALL),
+                (out, WALL - SOURCE_WALL),
+                (out, top),
+                tip,
+                (-tip[0], tip[1]),
+                (-out, top),
+            ]
         )
         ends = np.roll(corners, -1, axis=0)
-        points = [a + (b - a) * t for a, b in zip(corners, ends, strict=True) for t in np.linspace(0, 1, 8)[:-1]]
+        points = [
+            a + (b - a) * t for a, b in zip(corners, ends, strict=True) for t in np.linspace(0, 1, 8)[:-1]
+        ]
         return np.array(points) - (SOURCE_WIDTH / 2, SOURCE_HEIGHT)
 
     def mouth_centre(self, pose: np.ndarray) -> float:
@@ -134,11 +143,13 @@ class Receiver:
         return (np.abs(local[:, 0]) < self.size[0] / 2) & (np.abs(local[:, 1]) < self.size[1] / 2)
 
     def corners(self, pose: np.ndarray) -> np.ndarray:
-        """(12,) x, y, z of the four corners of the rim, counter-clockwise from (+x, +y), for the pose (x, y, yaw)."""
+        """(12,) x, y, z of the rim's corners, counter-clockwise from (+x, +y), for the pose (x, y, yaw)."""
         cos, sin = math.cos(pose[2]), math.sin(pose[2])
         a, b = self.size[0] / 2, self.size[1] / 2
         corners = [(a, b), (-a, b), (-a, -b), (a, -b)]
-        return np.array([(pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y, self.rim) for x, y in corners]).ravel()
+        return np.array(
+            [(pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y, self.rim) for x, y in corners]
+        ).ravel()
 
 
 def required_lift(outline: np.ndarray, pose: np.ndarray, receiver: Receiver, receiver_x: float) -> float:

@@ -12,13 +12,13 @@ class Material:
     """The properties that make 100 spheres behave like water, like bouncing balls or like paste.
 
     Two spheres at distance d within `reach` attract each other with the force attraction / d. The published
-    simulator also has a speed below which nothing bounces; contacts in MuJoCo are damped springs, which need no such
-    speed, and friction, which here separates the same materials, stands in its place.
+    simulator also has a speed below which nothing bounces; contacts in MuJoCo are damped springs, which need
+    no such speed, and friction, which here separates the same materials, stands in its place.
 
     Args:
         bounce: Speed after a collision divided by the speed before it, in [0.05, 0.95].
         friction: Coulomb friction coefficient of all contacts of the spheres, in [0.001, 2].
-        attraction: Constant K of the attraction between spheres of density 1 [length^4 / time^2], in [0, 1e-5].
+        attraction: Constant K between spheres of density 1 [length^4 / time^2], in [0, 1e-5].
         reach: Distance up to which spheres attract each other [length], in [0.05, 0.5].
 
     Raises:
@@ -47,8 +47,9 @@ class Material:
 
 _RANGES = {"bounce": (0.05, 0.95), "friction": (0.001, 2.0), "attraction": (0.0, 1e-5), "reach": (0.05, 0.5)}
 
-# Bounce, attraction and reach are those of the published simulator. Its friction of 0.001 lets nothing jam in MuJoCo,
-# where contacts do not stick as its softer ones do: 0.35 makes viscous material jam at a mouth of 0.13.
+# Bounce, attraction and reach are those of the published simulator. Its friction of 0.001 lets nothing jam in
+# MuJoCo, where contacts do not stick as its softer ones do: 0.35 makes viscous material jam at a mouth of
+# 0.13.
 MATERIALS = {
     "wat": Material(bounce=0.1, friction=0.1, attraction=0.0, reach=0.1),
     "bnc": Material(bounce=0.7, friction=0.1, attraction=0.0, reach=0.1),
@@ -62,7 +63,9 @@ def find_material(material: str | Material) -> Material:
     if isinstance(material, Material):
         return material
     if material not in MATERIALS:
-        raise ValueError(f"material: there is no {material!r}; choose from {list(MATERIALS)} or pass a Material")
+        raise ValueError(
+            f"material: there is no {material!r}; choose from {list(MATERIALS)} or pass a Material"
+        )
     return MATERIALS[material]
 
 

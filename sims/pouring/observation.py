@@ -59,7 +59,8 @@ def totals(behaviour: Behaviour) -> Observation:
 def flow(behaviour: Behaviour) -> Observation:
     """How much left the source in this trial, and where and how widely it came down at the height of the rim.
 
-    If nothing flowed, the centre is the middle of the mouth where the skill ended: the place it would have left from.
+    If nothing flowed, the centre is the middle of the mouth where the skill ended: the place it would have
+    left from.
     """
     census, trial = behaviour.census, behaviour.trial
     landings = census.landings

@@ -32,12 +32,17 @@ SPHERE_MASS = SPHERE_DENSITY * 4 / 3 * math.pi * SPHERE_RADIUS**3
 
 GRIPPER_SIZE = (0.105, 0.35, 0.1)  # each of two blocks, before and behind the source
 RECEIVER_DENSITY = 5000.0  # heavy: it weighs more than all spheres together
-CONTACT_TIME = 6 * TIME_STEP  # half a period of the undamped contact; from 4 steps down the bounce is left to chance
+CONTACT_TIME = (
+    6 * TIME_STEP
+)  # half a period of the undamped contact; from 4 steps down the bounce is left to chance
 ITERATIONS = 25  # of the contact solver, per physics step; with 15, bouncing spheres gain energy
-KINEMATIC_INERTIA = 20.0  # so large that the source follows its commands, so small that the solver stays accurate
+KINEMATIC_INERTIA = (
+    20.0  # so large that the source follows its commands, so small that the solver stays accurate
+)
 
-# Spheres dropped on each other and on walls with these damping ratios came back with these shares of their speed (mean
-# over 4 speeds and 10 phases of the step; the textbook's exp(-pi d / sqrt(1 - d^2)) is far lower for strong damping).
+# Spheres dropped on each other and on walls with these damping ratios came back with these shares of their
+# speed (mean over 4 speeds and 10 phases of the step; the textbook's exp(-pi d / sqrt(1 - d^2)) is far lower
+# for strong damping).
 _DAMPING = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 _BOUNCE = (0.942, 0.862, 0.748, 0.652, 0.57, 0.443, 0.35, 0.278, 0.228, 0.184, 0.156, 0.132)
 
@@ -54,7 +59,8 @@ def contact_damping(bounce: float) -> float:
 def compile_scene(material: Material, source: Source, receiver: Receiver) -> mujoco.MjModel:
     """Return the compiled model; nothing in it changes afterwards, so equal scenes share one.
 
-    Joints, in order: source x, z, tilt; gripper height on the source; receiver x, y, yaw; x, y, z of each sphere.
+    Joints, in order: source x, z, tilt; gripper height on the source; receiver x, y, yaw; x, y, z of each
+    sphere.
     """
     stiffness = (math.pi / CONTACT_TIME) ** 2
     damping = 2 * contact_damping(material.bounce) * math.sqrt(stiffness)
@@ -66,7 +72,7 @@ def compile_scene(material: Material, source: Source, receiver: Receiver) -> muj
     <flag autoreset="disable" island="disable"/>
   </option>
   <size memory="64M"/>
-  <visual><global offwidth="1280" offheight="960"/><headlight ambient="0.5 0.5 0.5" diffuse="0.5 0.5 0.5"/></visual>
+  <visual><global offwidth="1280" offheight="960"/><headlight ambient="0.5 0.5 0.5"/></visual>
   <asset><texture type="skybox" builtin="flat" rgb1="1 1 1" rgb2="1 1 1" width="8" height="48"/></asset>
   <default>
     <geom condim="3" friction="{material.friction} 0.005 0.0001" solref="{-stiffness} {-damping}"
@@ -85,9 +91,11 @@ def compile_scene(material: Material, source: Source, receiver: Receiver) -> muj
   </default>
   <worldbody>
     <light pos="0.5 -2 3" dir="0 0.5 -1" castshadow="false"/>
-    <geom name="floor" type="plane" size="5 5 0.1" contype="0" conaffinity="1" rgba="0.85 0.85 0.85 1"/>
+    <geom name="floor" type="plane" size="5 5 0.1" contype="0" conaffinity="1" rgba="0.75 0.75 0.75 1"/>
     <body name="source" gravcomp="1">
-      {_kinematic_joint("slide", "1 0 0")}{_kinematic_joint("slide", "0 0 1")}{_kinematic_joint("hinge", "0 1 0")}
+      {_kinematic_joint("slide", "1 0 0")}
+      {_kinematic_joint("slide", "0 0 1")}
+      {_kinematic_joint("hinge", "0 1 0")}
       {_source_geoms(source)}
       <body name="gripper" pos="{-SOURCE_WIDTH / 2} 0 {-SOURCE_HEIGHT}" gravcomp="1">
         {_kinematic_joint("slide", "0 0 1")}
@@ -110,7 +118,9 @@ def _kinematic_joint(kind: str, axis: str) -> str:
     return f'<joint type="{kind}" axis="{axis}" armature="{KINEMATIC_INERTIA}"/>'
 
 
-def _box(kind: str, centre: tuple[float, float, float], half: tuple[float, float, float], turn: str = "0 0 0") -> str:
+def _box(
+    kind: str, centre: tuple[float, float, float], half: tuple[float, float, float], turn: str = "0 0 0"
+) -> str:
     pos, size = (" ".join(f"{value:.9g}" for value in triple) for triple in (centre, half))
     return f'<geom class="{kind}" type="box" pos="{pos}" size="{size}" euler="{turn}"/>'
 
@@ -128,14 +138,18 @@ def _source_geoms(source: Source) -> str:
     side = INNER + half
     boxes = [_box("source", (x0, 0, z0 + WALL - half), (out, out, half))]
     for sign in (1, -1):
-        boxes.append(_box("source", (x0 + sign * side, 0, -SOURCE_HEIGHT / 2), (half, out, SOURCE_HEIGHT / 2)))
+        boxes.append(
+            _box("source", (x0 + sign * side, 0, -SOURCE_HEIGHT / 2), (half, out, SOURCE_HEIGHT / 2))
+        )
         boxes.append(_box("source", (x0, sign * side, -SOURCE_HEIGHT / 2), (out, half, SOURCE_HEIGHT / 2)))
     length, thickness = source.lip / math.sqrt(2), LIP_WALL / 2
     across = INNER - source.lip / 2 + thickness * math.sqrt(0.5)
     height = source.lip / 2 + thickness * math.sqrt(0.5)
     for sign in (1, -1):
         lean = sign * math.pi / 4
-        boxes.append(_box("source", (x0 + sign * across, 0, height), (length, INNER, thickness), f"0 {lean} 0"))
+        boxes.append(
+            _box("source", (x0 + sign * across, 0, height), (length, INNER, thickness), f"0 {lean} 0")
+        )
         boxes.append(_box("source", (x0, sign * across, height), (INNER, length, thickness), f"{-lean} 0 0"))
     return "".join(boxes)
 

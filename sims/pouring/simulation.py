@@ -25,7 +25,9 @@ from sims.pouring.scene import SPHERE_MASS, SUBSTEPS, TIME_STEP, compile_scene
 SERVO_GAIN = 10.0  # [1 / time]; velocity = gain * (command - pose)
 SPEED_LIMIT = np.array([1.0, 1.0, 2.0])  # of shoulder x, z [length / time] and tilt [rad / time]
 SPHERE_SPEED_LIMIT = 2.5  # a sphere may pass no more than half a wall in one physics step
-_STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # with the solver's warm start: the same state goes on the same way
+_STATE = (
+    mujoco.mjtState.mjSTATE_INTEGRATION
+)  # with the solver's warm start: the same state goes on the same way
 _SOURCE = slice(0, 3)
 _GRIPPER = 3
 _RECEIVER = slice(4, 7)
@@ -116,7 +118,9 @@ class Simulation:
         pitch = 2.1 * SPHERE_RADIUS
         edge = INNER - pitch / 2
         places = np.linspace(-edge, edge, 5)
-        z, y, x = np.meshgrid(WALL + pitch / 2 + pitch * np.arange(SPHERES // 25), places, places, indexing="ij")
+        z, y, x = np.meshgrid(
+            WALL + pitch / 2 + pitch * np.arange(SPHERES // 25), places, places, indexing="ij"
+        )
         layers = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
         layers += generator.uniform(-1e-3, 1e-3, layers.shape)
         self.data.qpos[_RECEIVER] = [receiver_x, 0.0, 0.0]
@@ -130,7 +134,7 @@ class Simulation:
         """Go on by one control step towards a command (x, z, tilt).
 
         Raises:
-            SimulationFailed: A position or velocity is no longer finite.
+            SimulationFailed: A velocity is no longer finite.
         """
         self.command = np.array(command, dtype=float)
         lift = required_lift(self._outline, self.command, self.receiver, float(self.receiver_pose[0]))
@@ -138,6 +142,7 @@ class Simulation:
         goal = self.command + (0.0, lift, 0.0)
         velocity = np.clip(SERVO_GAIN * (goal - self.pose), -SPEED_LIMIT, SPEED_LIMIT)
         data = self.data
+        before = data.qpos.copy()
         if self._attraction.active:
             data.qfrc_applied[_SPHERES] = SPHERE_MASS * self._attraction.accelerations(self.positions).ravel()
         for _ in range(SUBSTEPS):
@@ -145,6 +150,9 @@ class Simulation:
             data.qvel[_SOURCE] = velocity
             data.qvel[_GRIPPER] = 0.0
             mujoco.mj_step(self.model, data)
+            if not np.isfinite(data.qvel).all():
+                data.qpos[:], data.qvel[:] = before, 0.0  # what is looked at afterwards shall be finite
+                raise SimulationFailed(f"simulation: a velocity is not finite at time {self.time:.3f}")
             self.pose = self.pose + velocity * TIME_STEP
             self._limit_speeds()
         data.qpos[_SOURCE] = self.pose
@@ -154,10 +162,9 @@ class Simulation:
 
     def _limit_speeds(self) -> None:
         velocities = self.velocities
-        fastest = np.abs(velocities).max()
-        if not np.isfinite(fastest):
-            raise SimulationFailed(f"simulation: a sphere's velocity is not finite at time {self.time:.3f}")
-        if fastest > SPHERE_SPEED_LIMIT / 2:  # the largest component of too fast a sphere exceeds limit / sqrt(3)
+        if (
+            np.abs(velocities).max() > SPHERE_SPEED_LIMIT / 2
+        ):  # the largest component of too fast a sphere exceeds limit / sqrt(3)
             speeds = np.linalg.norm(velocities, axis=1)
             fast = speeds > SPHERE_SPEED_LIMIT
             velocities[fast] *= (SPHERE_SPEED_LIMIT / speeds[fast])[:, None]

@@ -1,7 +1,7 @@
 """The two ways to make material flow, and the move between places, as small state machines.
 
-Each yields one command per control step and sees only whether material flows and whether everything rests, so that it
-can be tested without physics.
+Each yields one command per control step and sees only whether material flows and whether everything rests, so
+that it can be tested without physics.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ class TipPhase(enum.Enum):
 class Tip:
     """Tilt the source, hold it while material flows, tilt on when the flow has stopped.
 
-    It ends after 5 time units without flow, counted from the last flow or from the end of the tilt; at the end of the
-    tilt it ends as soon as everything rests, because then nothing can happen any more.
+    It ends after 5 time units without flow, counted from the last flow or from the end of the tilt; at the
+    end of the tilt it ends as soon as everything rests, because then nothing can happen any more.
 
     Args:
         start: (3,) shoulder x, z [length] and tilt [rad].
@@ -122,7 +122,9 @@ class Shake:
         angle: Direction of a stroke, 0 towards the receiver, pi/2 upwards [rad].
     """
 
-    def __init__(self, start: np.ndarray, tilt_rate: float, speed: float, length: float, angle: float) -> None:
+    def __init__(
+        self, start: np.ndarray, tilt_rate: float, speed: float, length: float, angle: float
+    ) -> None:
         self.phase = ShakePhase.APPROACH
         self._start = np.array(start, dtype=float)
         self._tilt = float(start[2])

@@ -18,6 +18,9 @@ from sims.pouring.observation import Observation
 from sims.pouring.scene import CONTROL_STEP
 from sims.pouring.simulation import Simulation, SimulationFailed, SimulationState
 
+Actions = Mapping[str, ArrayLike]
+Selections = Mapping[str, str]
+
 RECEIVER_RANGE = (0.5, 1.1)
 SETTLE_TIME = 3.0  # at most; spheres that bounce take that long
 SETTLED_SPEED = 0.01  # root mean square
@@ -43,9 +46,9 @@ class PouringWorld:
         start -> grasped -> at_receiver -> at_pour -> ready -> tipped | shaken -> poured -> at_receiver ...
                        \\-> receiver_moved
 
-    `reset` returns what is observed at "start"; `execute` does what leaves a node and returns what was observed on the
-    way to each node that it leads to. After "poured", the trial loop leads to "at_receiver" again, or nowhere once the
-    episode is over.
+    `reset` returns what is observed at "start"; `execute` does what leaves a node and returns what was
+    observed on the way to each node that it leads to. After "poured", the trial loop leads to "at_receiver"
+    again, or nowhere once the episode is over.
 
     Args:
         material: A name of `MATERIALS`, a Material, or a sequence of those from which every reset draws.
@@ -110,14 +113,14 @@ class PouringWorld:
         return observation.setting(self.behaviour, target) | observation.situation(self.behaviour, target)
 
     def execute(
-        self, node: str, actions: Mapping[str, ArrayLike], selections: Mapping[str, str] | None = None
+        self, node: str, actions: Actions, selections: Selections | None = None
     ) -> dict[str, Observation]:
         """Do what leaves a node.
 
         Args:
             node: Where the episode stands.
-            actions: Label -> value, at least for the actions that leave this node; others are not looked at. Values
-                outside the bounds of `ACTIONS` are clamped, which `clamps` reports.
+            actions: Label -> value, at least for the actions that leave this node; others are not looked
+                at. Values outside the bounds of `ACTIONS` are clamped, which `clamps` reports.
             selections: {"skill": "tip" or "shake"}, needed at "ready".
 
         Returns:
@@ -125,7 +128,8 @@ class PouringWorld:
 
         Raises:
             ValueError: The episode does not stand at that node; an action is missing or not finite.
-            SimulationFailed: The physics broke down; its `observed` holds what was measured. The episode is over.
+            SimulationFailed: The physics broke down; its `observed` holds what was measured. The episode is
+                over.
         """
         behaviour = self.behaviour
         if self.end is not None:
@@ -197,13 +201,11 @@ class PouringWorld:
         simulation.restore(state)
         self._behaviour = Behaviour(simulation, target, self._time_limit)
 
-    def _grasp(self, actions: Mapping[str, ArrayLike], selections: Mapping[str, str]) -> dict[str, Observation]:
+    def _grasp(self, actions: Actions, selections: Selections) -> dict[str, Observation]:
         (ratio,) = read_action(self.node, actions, "grasp_ratio", self.clamps)
         return {"grasped": {"grasp_height": self.behaviour.grasp(float(ratio))}}
 
-    def _move_to_receiver(
-        self, actions: Mapping[str, ArrayLike], selections: Mapping[str, str]
-    ) -> dict[str, Observation]:
+    def _move_to_receiver(self, actions: Actions, selections: Selections) -> dict[str, Observation]:
         before = observation.places(self.behaviour)["receiver_corners"]
         speed = self.behaviour.move_to_receiver()
         after = observation.places(self.behaviour)
@@ -215,16 +217,16 @@ class PouringWorld:
             },
         }
 
-    def _move_to_pour(self, actions: Mapping[str, ArrayLike], selections: Mapping[str, str]) -> dict[str, Observation]:
+    def _move_to_pour(self, actions: Actions, selections: Selections) -> dict[str, Observation]:
         x, z = read_action(self.node, actions, "pour_position", self.clamps)
         self.behaviour.move_to_pour(float(x), float(z))
         return {"at_pour": observation.relative_position(self.behaviour)}
 
-    def _get_ready(self, actions: Mapping[str, ArrayLike], selections: Mapping[str, str]) -> dict[str, Observation]:
+    def _get_ready(self, actions: Actions, selections: Selections) -> dict[str, Observation]:
         self.behaviour.get_ready()
         return {"ready": {}}
 
-    def _pour(self, actions: Mapping[str, ArrayLike], selections: Mapping[str, str]) -> dict[str, Observation]:
+    def _pour(self, actions: Actions, selections: Selections) -> dict[str, Observation]:
         skill = selections.get("skill")
         read = functools.partial(read_action, self.node, actions, clamps=self.clamps)
         if skill == "tip":
@@ -235,14 +237,16 @@ class PouringWorld:
                 float(read("tilt_rate")[0]), float(read("shake_speed")[0]), float(length), float(angle)
             )
         else:
-            raise ValueError(f"node {self.node!r}: selection 'skill' is {skill!r}; choose from {list(SKILLS)}")
+            raise ValueError(
+                f"node {self.node!r}: selection 'skill' is {skill!r}; choose from {list(SKILLS)}"
+            )
         return {self.node: observation.flow(self.behaviour)}
 
-    def _measure(self, actions: Mapping[str, ArrayLike], selections: Mapping[str, str]) -> dict[str, Observation]:
+    def _measure(self, actions: Actions, selections: Selections) -> dict[str, Observation]:
         self.behaviour.measure()
         return {"poured": observation.changes(self.behaviour)}
 
-    def _try_again(self, actions: Mapping[str, ArrayLike], selections: Mapping[str, str]) -> dict[str, Observation]:
+    def _try_again(self, actions: Actions, selections: Selections) -> dict[str, Observation]:
         self.end = self.behaviour.end
         if self.end is not None:
             return {}
@@ -262,7 +266,9 @@ _EDGES = {
 }
 
 
-def _check_range(name: str, value: float | tuple[float, float], limits: tuple[float, float]) -> tuple[float, float]:
+def _check_range(
+    name: str, value: float | tuple[float, float], limits: tuple[float, float]
+) -> tuple[float, float]:
     low, high = value if isinstance(value, tuple) else (value, value)
     if not limits[0] <= low <= high <= limits[1]:
         raise ValueError(f"{name}: {value!r} is not a number or (low, high) from {limits[0]} to {limits[1]}")
@@ -270,7 +276,9 @@ def _check_range(name: str, value: float | tuple[float, float], limits: tuple[fl
 
 
 @functools.lru_cache(maxsize=256)
-def _settle(material: Material, source: Source, receiver: Receiver, receiver_x: float, seed: int) -> SimulationState:
+def _settle(
+    material: Material, source: Source, receiver: Receiver, receiver_x: float, seed: int
+) -> SimulationState:
     """Return the state in which the spheres, dropped into the upright source, have come to rest."""
     simulation = Simulation(material, source, receiver)
     simulation.fill(receiver_x, np.random.default_rng([seed, 1]))

@@ -1,13 +1,13 @@
 """Measure the pouring world: one attempt per row, written to CSV files beside this script as it happens.
 
-Run from the repository's root, `PYTHONPATH=. python docs/reproduction/pouring_world/measure.py table jamming`. Rows that
-are in a file already are not measured again, so a stopped run goes on where it was.
+Run from the repository's root, `PYTHONPATH=. python docs/reproduction/pouring_world/measure.py table
+jamming`. Rows that are in a file already are not measured again, so a stopped run goes on where it was.
 """
 
 from __future__ import annotations
 
-import argparse
 import csv
+import enum
 import hashlib
 import time
 from collections.abc import Iterator
@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import typer
 
 from sims.pouring import ACTIONS, MATERIALS, SKILLS, Material, PouringWorld, SimulationFailed
 from sims.pouring.observation import flow
@@ -23,18 +24,53 @@ FOLDER = Path(__file__).parent
 MOUTHS = (0.11, 0.13, 0.17, 0.20, 0.23, 0.25)
 GOOD = {
     "tip": {"pour_position": (-0.19, 0.33), "tilt_rate": 0.014, "search_rate": 0.003},
-    "shake": {"pour_position": (-0.20, 0.33), "tilt_rate": 0.014, "shake_speed": 0.75, "shake_stroke": (0.06, -1.5708)},
+    "shake": {
+        "pour_position": (-0.20, 0.33),
+        "tilt_rate": 0.014,
+        "shake_speed": 0.75,
+        "shake_stroke": (0.06, -1.5708),
+    },
 }
-COLUMNS = (
-    "label material bounce friction attraction reach mouth skill seed px pz tilt_rate search_rate shake_speed "
-    "shake_length shake_angle received spilled released stop skill_time simulated_time cpu flow_x flow_variance leaked "
-    "slowed lift failed digest"
-).split()
+GIVEN = (
+    "label",
+    "material",
+    "bounce",
+    "friction",
+    "attraction",
+    "reach",
+    "mouth",
+    "skill",
+    "seed",
+    "px",
+    "pz",
+    "tilt_rate",
+    "search_rate",
+    "shake_speed",
+    "shake_length",
+    "shake_angle",
+)
+MEASURED = (
+    "received",
+    "spilled",
+    "released",
+    "stop",
+    "skill_time",
+    "simulated_time",
+    "cpu",
+    "flow_x",
+    "flow_variance",
+    "leaked",
+    "slowed",
+    "lift",
+    "failed",
+    "digest",
+)
+COLUMNS = GIVEN + MEASURED
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """One attempt to measure: the setup, the skill with its actions, the seed, and a label that says what for."""
+    """One attempt to measure: the setup, the skill with its actions, the seed, and what it is for."""
 
     label: str
     material: Material
@@ -43,6 +79,29 @@ class Attempt:
     skill: str
     actions: dict[str, float | tuple[float, float]]
     seed: int
+
+    def columns(self) -> dict[str, object]:
+        """What identifies the attempt in a file."""
+        px, pz = self.actions["pour_position"]
+        length, angle = self.actions.get("shake_stroke", ("", ""))
+        return {
+            "label": self.label,
+            "material": self.name,
+            "bounce": self.material.bounce,
+            "friction": self.material.friction,
+            "attraction": self.material.attraction,
+            "reach": self.material.reach,
+            "mouth": self.mouth,
+            "skill": self.skill,
+            "seed": self.seed,
+            "px": px,
+            "pz": pz,
+            "tilt_rate": self.actions["tilt_rate"],
+            "search_rate": self.actions.get("search_rate", ""),
+            "shake_speed": self.actions.get("shake_speed", ""),
+            "shake_length": length,
+            "shake_angle": angle,
+        }
 
 
 def perform(attempt: Attempt) -> dict[str, object]:
@@ -61,25 +120,7 @@ def perform(attempt: Attempt) -> dict[str, object]:
     behaviour = world.behaviour
     census, simulation = behaviour.census, behaviour.simulation
     measured = flow(behaviour)
-    px, pz = actions["pour_position"]
-    length, angle = actions.get("shake_stroke", ("", ""))
-    return {
-        "label": attempt.label,
-        "material": attempt.name,
-        "bounce": attempt.material.bounce,
-        "friction": attempt.material.friction,
-        "attraction": attempt.material.attraction,
-        "reach": attempt.material.reach,
-        "mouth": attempt.mouth,
-        "skill": attempt.skill,
-        "seed": attempt.seed,
-        "px": px,
-        "pz": pz,
-        "tilt_rate": actions["tilt_rate"],
-        "search_rate": actions.get("search_rate", ""),
-        "shake_speed": actions.get("shake_speed", ""),
-        "shake_length": length,
-        "shake_angle": angle,
+    return attempt.columns() | {
         "received": census.in_receiver,
         "spilled": census.spilled,
         "released": len(census.classes) - census.in_source,
@@ -91,7 +132,9 @@ def perform(attempt: Attempt) -> dict[str, object]:
         "flow_variance": round(float(measured["flow_variance"]), 5),
         "leaked": len(census.leaked),
         "slowed": simulation.slowed,
-        "lift": round(max([clamp.used[0] for clamp in world.clamps if clamp.label == "lift"], default=0.0), 4),
+        "lift": round(
+            max([clamp.used[0] for clamp in world.clamps if clamp.label == "lift"], default=0.0), 4
+        ),
         "failed": failed,
         "digest": hashlib.sha256(simulation.data.qpos.tobytes()).hexdigest()[:16],
     }
@@ -126,7 +169,10 @@ def extremes() -> Iterator[Attempt]:
         for skill in SKILLS:
             name = str(generator.choice(list(MATERIALS)))
             mouth = round(float(generator.uniform(0.11, 0.25)), 4)
-            drawn = {label: generator.uniform(bounds.low, bounds.high).round(4) for label, bounds in ACTIONS.items()}
+            drawn = {
+                label: generator.uniform(bounds.low, bounds.high).round(4)
+                for label, bounds in ACTIONS.items()
+            }
             actions = {label: tuple(v.tolist()) if len(v) > 1 else float(v[0]) for label, v in drawn.items()}
             yield Attempt(f"random {number}", MATERIALS[name], name, mouth, skill, actions, number)
 
@@ -137,7 +183,7 @@ def again() -> Iterator[Attempt]:
 
 
 def dependence() -> Iterator[Attempt]:
-    """One action after the other varied at SETUP1 under tipping and at SETUP2 under shaking, 10 seeds each."""
+    """One action after the other varied, tipping at SETUP1 and shaking at SETUP2, 10 seeds each."""
     tip, shake = GOOD["tip"], GOOD["shake"]
     variations: list[tuple[str, dict[str, float | tuple[float, float]]]] = [("tip", tip), ("shake", shake)]
     variations += [("tip", {**tip, "tilt_rate": rate}) for rate in (0.010, 0.017, 0.020)]
@@ -146,7 +192,9 @@ def dependence() -> Iterator[Attempt]:
     variations += [("tip", {**tip, "pour_position": (-0.19, z)}) for z in (0.38, 0.43, 0.48)]
     variations += [("shake", {**shake, "shake_speed": speed}) for speed in (0.70, 0.80, 0.90)]
     variations += [("shake", {**shake, "shake_stroke": (length, -1.5708)}) for length in (0.05, 0.08, 0.10)]
-    variations += [("shake", {**shake, "shake_stroke": (0.06, angle)}) for angle in (-0.7854, 0.0, 0.7854, 1.5708)]
+    variations += [
+        ("shake", {**shake, "shake_stroke": (0.06, angle)}) for angle in (-0.7854, 0.0, 0.7854, 1.5708)
+    ]
     variations += [("shake", {**shake, "pour_position": (x, 0.33)}) for x in (-0.30, -0.25, -0.15, -0.10)]
     setups = {"tip": ("bnc", 0.23), "shake": ("vsc", 0.13)}
     for seed in range(10):
@@ -156,11 +204,14 @@ def dependence() -> Iterator[Attempt]:
 
 
 def best() -> Iterator[Attempt]:
-    """Random action sets within the useful part of the bounds, at SETUP1 under tipping and SETUP2 under shaking."""
+    """Random action sets in the useful part of the bounds, tipping at SETUP1 and shaking at SETUP2."""
     generator = np.random.default_rng(1)
     candidates: list[tuple[str, dict[str, float | tuple[float, float]]]] = []
     for _ in range(12):
-        x, z = round(float(generator.uniform(-0.26, -0.14)), 4), round(float(generator.uniform(0.32, 0.38)), 4)
+        x, z = (
+            round(float(generator.uniform(-0.26, -0.14)), 4),
+            round(float(generator.uniform(0.32, 0.38)), 4),
+        )
         rates = [round(float(generator.uniform(b.low[0], b.high[0])), 4) for b in _rates()]
         candidates.append(("tip", {"pour_position": (x, z), "tilt_rate": rates[0], "search_rate": rates[1]}))
         stroke = generator.uniform(ACTIONS["shake_stroke"].low, ACTIONS["shake_stroke"].high).round(4)
@@ -188,43 +239,32 @@ def _rates() -> tuple:
 def measure(name: str, attempts: Iterator[Attempt]) -> None:
     """Add the rows that are missing to a CSV file."""
     path = FOLDER / f"{name}.csv"
-    key = "label material mouth skill seed px pz tilt_rate search_rate shake_speed shake_length shake_angle".split()
-    done = set()
+    done: list[list[str]] = []
     if path.exists():
         with path.open(newline="") as file:
-            done = {tuple(row[column] for column in key) for row in csv.DictReader(file)}
+            done = [row[: len(COLUMNS) - len(MEASURED)] for row in csv.reader(file)]
     with path.open("a", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS)
         if file.tell() == 0:
             writer.writeheader()
         for attempt in attempts:
-            px, pz = attempt.actions["pour_position"]
-            length, angle = attempt.actions.get("shake_stroke", ("", "")) if attempt.skill == "shake" else ("", "")
-            known = (
-                attempt.label,
-                attempt.name,
-                attempt.mouth,
-                attempt.skill,
-                attempt.seed,
-                px,
-                pz,
-                attempt.actions["tilt_rate"],
-                attempt.actions.get("search_rate", ""),
-                attempt.actions.get("shake_speed", ""),
-                attempt.actions.get("shake_stroke", ("", ""))[0],
-                attempt.actions.get("shake_stroke", ("", ""))[1],
-            )
-            del length, angle
-            if tuple(str(value) for value in known) in done:
-                continue
-            writer.writerow(perform(attempt))
-            file.flush()
+            if [str(value) for value in attempt.columns().values()] not in done:
+                writer.writerow(perform(attempt))
+                file.flush()
 
 
-EXPERIMENTS = {function.__name__: function for function in (table, jamming, extremes, again, dependence, best)}
+EXPERIMENTS = {
+    function.__name__: function for function in (table, jamming, extremes, again, dependence, best)
+}
+
+Experiment = enum.StrEnum("Experiment", list(EXPERIMENTS))
+
+
+def main(experiments: list[Experiment]) -> None:
+    """Measure what is named, where it has not been measured already."""
+    for name in experiments:
+        measure(name, EXPERIMENTS[name]())
+
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("experiments", nargs="+", choices=list(EXPERIMENTS))
-    for name in parser.parse_args().experiments:
-        measure(name, EXPERIMENTS[name]())
+    typer.run(main)
