@@ -15,18 +15,14 @@ from sims.pouring.scene import CONTROL_STEP
 from sims.pouring.simulation import Simulation, SimulationState
 from sims.pouring.skills import Move, Shake, Tip
 
-WAYPOINT = (
-    -0.3,
-    0.35,
-)  # shoulder's x from the receiver's centre and z above its rim before and after a trial
+WAYPOINT = (-0.3, 0.35)  # shoulder's x from the receiver's centre and z above its rim, around a trial
 CARRY_TILT = math.pi / 4
 POUR_TILT = math.pi / 3  # before and after a flow; at 45 degrees a low source would stand on the floor
 CARRY_SPEED = 0.3  # to the receiver and back to the waypoint [length / time]
 APPROACH_SPEED = 0.1  # to the pouring position [length / time]
 CARRY_TILT_SPEED = 0.8  # [rad / time]
-RETURN_TILT_SPEED = (
-    1.6  # after a flow [rad / time]; what is still to come falls until the source has turned back
-)
+# After a flow [rad / time]; what is still to come falls until the source has turned back.
+RETURN_TILT_SPEED = 1.6
 ARRIVED = 0.005  # distance to the goal, in length and rad, at which a move ends
 
 SPHERE_AMOUNT = 0.0055  # amount of one sphere, poured or let out

@@ -32,13 +32,11 @@ SPHERE_MASS = SPHERE_DENSITY * 4 / 3 * math.pi * SPHERE_RADIUS**3
 
 GRIPPER_SIZE = (0.105, 0.35, 0.1)  # each of two blocks, before and behind the source
 RECEIVER_DENSITY = 5000.0  # heavy: it weighs more than all spheres together
-CONTACT_TIME = (
-    6 * TIME_STEP
-)  # half a period of the undamped contact; from 4 steps down the bounce is left to chance
+# Half a period of the undamped contact; from 4 steps down the bounce is left to chance.
+CONTACT_TIME = 6 * TIME_STEP
 ITERATIONS = 25  # of the contact solver, per physics step; with 15, bouncing spheres gain energy
-KINEMATIC_INERTIA = (
-    20.0  # so large that the source follows its commands, so small that the solver stays accurate
-)
+# So large that the source follows its commands, so small that the solver stays accurate.
+KINEMATIC_INERTIA = 20.0
 
 # Spheres dropped on each other and on walls with these damping ratios came back with these shares of their
 # speed (mean over 4 speeds and 10 phases of the step; the textbook's exp(-pi d / sqrt(1 - d^2)) is far lower

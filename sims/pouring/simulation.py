@@ -25,9 +25,8 @@ from sims.pouring.scene import SPHERE_MASS, SUBSTEPS, TIME_STEP, compile_scene
 SERVO_GAIN = 10.0  # [1 / time]; velocity = gain * (command - pose)
 SPEED_LIMIT = np.array([1.0, 1.0, 2.0])  # of shoulder x, z [length / time] and tilt [rad / time]
 SPHERE_SPEED_LIMIT = 2.5  # a sphere may pass no more than half a wall in one physics step
-_STATE = (
-    mujoco.mjtState.mjSTATE_INTEGRATION
-)  # with the solver's warm start: the same state goes on the same way
+# With the solver's warm start: the same state goes on the same way.
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 _SOURCE = slice(0, 3)
 _GRIPPER = 3
 _RECEIVER = slice(4, 7)

@@ -103,10 +103,10 @@ class PouringWorld:
         """
         generator = np.random.default_rng(seed)
         # All are drawn, whether fixed or not, so that fixing one leaves the others as they were.
-        material = self._materials[int(generator.integers(len(self._materials)))]
         mouth = float(generator.uniform(*self._mouth))
         target = float(generator.uniform(*self._target))
         receiver_x = float(generator.uniform(*self._receiver_x))
+        material = self._materials[int(generator.integers(len(self._materials)))]
         settled = _settle(material, Source(mouth), self._receiver, receiver_x, seed)
         self._begin(material, mouth, target, settled)
         self.clamps, self.end = [], None
