@@ -33,7 +33,7 @@ class Census:
         classes: (n,) SphereClass of each sphere.
         in_source: Number of spheres in the source.
         in_receiver: Number of spheres in the receiver, moving or not, with the heap that rests above its rim.
-        spilled: The most spheres that have been on the floor or far away at once.
+        spilled: The most spheres that have been on the floor, piled up on it or far away at once.
         flowing: Number of spheres on their way from the source.
         leaked: Indices of spheres that went through a wall or the floor.
     """
@@ -73,12 +73,14 @@ class Census:
 
         inside_receiver = above & (height < top)
         received = above & (height < rim + HEAP_HEIGHT) & (speeds < RESTING_SPEED)
-        on_floor = outside & ~inside_receiver & (height < 2 * SPHERE_RADIUS)
-        on_floor |= (np.abs(simulation.positions[:, :2]) > FAR).any(axis=1)
+        # Sticky material piles up beside the receiver: what rests there is spilled, however high it lies.
+        piled = (height < rim) & (speeds < RESTING_SPEED)
+        spilled = outside & ~above & ((height < 2 * SPHERE_RADIUS) | piled)
+        spilled |= (np.abs(simulation.positions[:, :2]) > FAR).any(axis=1)
         came_out = self.classes <= SphereClass.FLOWING
         classes = np.full(SPHERES, SphereClass.BOUNCED)
         classes[came_out & ~inside_receiver & (speeds > HANGING_SPEED)] = SphereClass.FLOWING
-        classes[on_floor] = SphereClass.SPILLED
+        classes[spilled] = SphereClass.SPILLED
         classes[received] = SphereClass.RECEIVED
         classes[self._in_source] = SphereClass.SOURCE
 
@@ -90,7 +92,7 @@ class Census:
         self.classes = classes
         self.in_source = int(self._in_source.sum())
         self.in_receiver = int((inside_receiver | received).sum())
-        self.spilled = max(self.spilled, int(on_floor.sum()))
+        self.spilled = max(self.spilled, int(spilled.sum()))
         self.flowing = int((classes == SphereClass.FLOWING).sum())
 
     def _look(self, simulation: Simulation) -> None:
@@ -116,7 +118,9 @@ class Census:
         low = simulation.receiver.rim - SPHERE_RADIUS
         height = self._from_receiver[:, 2]
         walled = (was_above != self._above_receiver) & (before_receiver[:, 2] < low) & (height < low)
-        self.leaked.update(np.flatnonzero(walled | (height < 0.0)).tolist())
+        # Contacts are soft: a fast sphere dips its lower half into the floor before it bounces.
+        sunk = height < -SPHERE_RADIUS
+        self.leaked.update(np.flatnonzero(walled | sunk).tolist())
 
     def copy(self) -> Census:
         """Return an independent copy."""

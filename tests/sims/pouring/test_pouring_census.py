@@ -80,6 +80,13 @@ def test_spilled_spheres_stay_spilled(scene):
 def test_resting_outside_is_neither_flow_nor_spill(scene):
     simulation, census = scene
     assert place(simulation, census, (0.4, 0.0, 0.3)) is SphereClass.BOUNCED
+    assert census.spilled == 0
+
+
+def test_a_pile_beside_the_receiver_is_spilled(scene):
+    simulation, census = scene
+    assert place(simulation, census, (0.99, 0.0, 0.12), (0.0, 0.0, -0.5)) is SphereClass.FLOWING
+    assert place(simulation, census, (0.99, 0.0, 0.12)) is SphereClass.SPILLED
 
 
 @pytest.mark.parametrize(
@@ -90,7 +97,7 @@ def test_resting_outside_is_neither_flow_nor_spill(scene):
         ((0.11, 0.0, 0.5), (0.16, 0.0, 0.53)),  # through its lip
         ((0.8, 0.0, 0.1), (1.0, 0.0, 0.1)),  # out of the receiver
         ((0.8, 0.3, 0.1), (0.8, 0.1, 0.1)),  # into it
-        ((0.4, 0.0, 0.03), (0.4, 0.0, -0.01)),  # through the floor
+        ((0.4, 0.0, 0.0), (0.4, 0.0, -0.03)),  # through the floor
     ],
 )
 def test_leaks_are_noticed(scene, before, after):
