@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -142,7 +144,13 @@ def viewer(world: PouringWorld, speed: float = 1.0) -> Iterator[None]:
     Args:
         world: Whose present episode is shown; reset it before.
         speed: Simulated time per second.
+
+    Raises:
+        RuntimeError: There is no screen.
     """
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        # MuJoCo would end the whole process instead of raising.
+        raise RuntimeError("viewer: there is no screen (DISPLAY is not set); use film and write_video")
     import mujoco.viewer  # it needs a screen already when it is imported
 
     simulation = world.behaviour.simulation

@@ -1,6 +1,7 @@
 """Turn the measured attempts into the tables and pictures of the page.
 
-Run from the repository's root after `measure.py`: `PYTHONPATH=. python docs/reproduction/pouring_world/report.py`.
+Run from the repository's root after `measure.py`:
+`PYTHONPATH=. python docs/reproduction/pouring_world/report.py`.
 """
 
 from __future__ import annotations
@@ -115,6 +116,9 @@ ACTION_COLUMNS = {
 }
 
 
+SETTINGS = ("px", "pz", "tilt_rate", "search_rate", "shake_speed", "shake_length", "shake_angle")
+
+
 def dependence() -> None:
     """Received and spilled spheres as one action is varied."""
     rows = read("dependence")
@@ -122,11 +126,10 @@ def dependence() -> None:
     lines = []
     for line, (skill, names) in zip(axes, ACTION_COLUMNS.items(), strict=True):
         mine = [row for row in rows if row["skill"] == skill]
-        settings = ("px", "pz", "tilt_rate", "search_rate", "shake_speed", "shake_length", "shake_angle")
-        groups = group(mine, lambda row: tuple(row[name] for name in settings))
+        groups = group(mine, lambda row: tuple(row[name] for name in SETTINGS))
         centre = next(iter(groups))
         for axis, name in zip(line, names, strict=True):
-            place = settings.index(name)
+            place = SETTINGS.index(name)
             chosen = {
                 float(key[place]): found
                 for key, found in groups.items()
@@ -162,9 +165,9 @@ def dependence() -> None:
 
 
 def best() -> None:
-    """What each action set keeps to in 8 of 10 seeds: how short, how much over and how many spilled at most."""
+    """What each action set keeps to in 8 of 10 seeds: spheres short, over and spilled at most."""
     rows = [row for name in ("dependence", "best") if (FOLDER / f"{name}.csv").exists() for row in read(name)]
-    actions = ("skill", "px", "pz", "tilt_rate", "search_rate", "shake_speed", "shake_length", "shake_angle")
+    actions = ("skill", *SETTINGS)
     lines = []
     for key, found in group(rows, lambda row: tuple(row[name] for name in actions)).items():
         if len({row["seed"] for row in found}) < 10:

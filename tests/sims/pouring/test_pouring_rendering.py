@@ -1,12 +1,14 @@
 """Pictures and videos: they show the classes, disturb nothing and reach the disk."""
 
+import sys
+
 import imageio.v3 as imageio
 import numpy as np
 import pytest
 
 from sims.pouring import PouringWorld
 from sims.pouring.census import SphereClass
-from sims.pouring.rendering import Camera, film, strip, write_picture, write_video
+from sims.pouring.rendering import Camera, film, strip, viewer, write_picture, write_video
 
 
 @pytest.fixture
@@ -54,3 +56,11 @@ def test_a_film_becomes_a_strip_and_a_video(world, tmp_path):
     with pytest.raises(ValueError, match="ends in neither .mp4 nor .gif"):
         write_video(tmp_path / "film.avi", frames, fps=10)
     camera.close()
+
+
+def test_a_missing_screen_is_named(world, monkeypatch):
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(RuntimeError, match="there is no screen"), viewer(world):
+        pass

@@ -1,0 +1,82 @@
+"""Measure the attraction's share of an attempt and what a second process gains.
+
+Run from the repository's root on an otherwise idle machine:
+`PYTHONPATH=. python docs/reproduction/pouring_world/speed.py`.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import time
+from pathlib import Path
+
+import joblib
+import numpy as np
+
+from sims.pouring import PouringWorld, run_episodes
+from sims.pouring.attraction import Attraction
+
+FOLDER = Path(__file__).parent
+ACTIONS = {
+    "grasp_ratio": 0.3,
+    "pour_position": (-0.2, 0.33),
+    "tilt_rate": 0.014,
+    "search_rate": 0.003,
+    "shake_speed": 0.75,
+    "shake_stroke": (0.06, -1.5708),
+}
+
+
+def attraction_share(material: str, skill: str) -> tuple[float, float]:
+    """Return the CPU time of an attempt and the part of it that goes into the attraction."""
+    spent = 0.0
+    plain = Attraction.accelerations
+
+    def timed(self: Attraction, positions: np.ndarray) -> np.ndarray:
+        nonlocal spent
+        begin = time.process_time()
+        accelerations = plain(self, positions)
+        spent += time.process_time() - begin
+        return accelerations
+
+    world = PouringWorld(material, 0.17)
+    world.reset(0)
+    Attraction.accelerations = timed  # type: ignore[method-assign]
+    begin = time.process_time()
+    try:
+        while world.node != "poured":
+            world.execute(world.node, ACTIONS, {"skill": skill})
+    finally:
+        Attraction.accelerations = plain  # type: ignore[method-assign]
+    total = time.process_time() - begin
+    return total, spent / total
+
+
+def speed_up(episodes: int = 12) -> tuple[float, float]:
+    """Return the wall-clock times of the same episodes in one and in two processes."""
+    jobs = [({"material": "wat", "mouth": 0.25}, ACTIONS, "shake", seed) for seed in range(episodes)]
+    times = []
+    for processes in (1, 2):
+        with joblib.parallel_config("loky", n_jobs=processes):
+            run_episodes(jobs[:processes], 1, processes)  # starts the processes
+            begin = time.perf_counter()
+            run_episodes(jobs, 1, processes)
+            times.append(time.perf_counter() - begin)
+    return times[0], times[1]
+
+
+if __name__ == "__main__":
+    rows: list[list[object]] = [["what", "value"]]
+    for material in ("vsc", "vsc+"):
+        for skill in ("tip", "shake"):
+            cpu, share = attraction_share(material, skill)
+            rows.append([f"{material} {skill}: CPU seconds", round(cpu, 2)])
+            rows.append([f"{material} {skill}: share of the attraction", round(share, 3)])
+    rows.append(["other processes that were running", round(os.getloadavg()[0], 1)])
+    one, two = speed_up()
+    rows.append(["12 episodes in one process, seconds", round(one, 2)])
+    rows.append(["12 episodes in two processes, seconds", round(two, 2)])
+    rows.append(["speed-up", round(one / two, 2)])
+    with (FOLDER / "speed.csv").open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
