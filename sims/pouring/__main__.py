@@ -18,6 +18,7 @@ from sims.pouring.world import PouringWorld
 MaterialName = enum.StrEnum("MaterialName", list(MATERIALS))
 Skill = enum.StrEnum("Skill", list(SKILLS))
 FRAME_STEPS = 2  # control steps from one frame of a video to the next: 20 frames per unit of simulated time
+STILL_STEPS = 20  # the same where only a strip is asked for, since drawing takes longer than simulating
 
 
 def main(
@@ -46,7 +47,7 @@ def main(
             if view:
                 stack.enter_context(viewer(world))
             if pictures or video:
-                frames = stack.enter_context(film(world, camera, FRAME_STEPS))
+                frames = stack.enter_context(film(world, camera, FRAME_STEPS if video else STILL_STEPS))
 
         episode = run_episode(world, policy, seed, trials, begin)
     camera.close()
