@@ -156,6 +156,7 @@ def jamming() -> Iterator[Attempt]:
         for share in (1.0, 0.8, 0.6, 0.4, 0.2, 0.0):
             material = replace(vsc, attraction=share * vsc.attraction)
             yield Attempt(f"attraction {share}", material, "vsc", 0.13, "tip", GOOD["tip"], seed)
+        for share in (1.0, 0.8, 0.6, 0.4, 0.3, 0.2, 0.0):
             material = replace(vsc, friction=max(0.001, share * vsc.friction))
             yield Attempt(f"friction {share}", material, "vsc", 0.13, "tip", GOOD["tip"], seed)
         for mouth in (0.13, 0.15, 0.17, 0.19, 0.21, 0.23, 0.25):

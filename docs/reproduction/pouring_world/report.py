@@ -59,7 +59,7 @@ def span(values: np.ndarray) -> str:
 def table() -> None:
     """Received and spilled spheres by material, mouth and skill."""
     groups = group(read("table"), lambda row: (row["material"], float(row["mouth"]), row["skill"]))
-    materials = list(dict.fromkeys(key[0] for key in groups))
+    materials = ("wat", "bnc", "vsc", "vsc+")
     mouths = sorted({key[1] for key in groups})
     rows = []
     for material in materials:
