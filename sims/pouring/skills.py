@@ -16,7 +16,7 @@ from sims.pouring.scene import CONTROL_STEP
 END_TILT = 0.9 * math.pi  # 162 degrees: further tilting changes nothing
 TIP_PATIENCE = 5.0  # time without flow after which tipping gives up
 SHAKE_PATIENCE = 3.0  # the same for shaking
-PAUSE = 4  # control steps between two pairs of strokes
+PAUSE = 0.1  # time between two pairs of strokes
 
 
 class Move:
@@ -129,9 +129,9 @@ class Shake:
         self._start = np.array(start, dtype=float)
         self._tilt = float(start[2])
         self._tilt_rate = tilt_rate
-        self._stroke = length * np.array([math.cos(angle), math.sin(angle), 0.0])
-        self._half = max(1, math.ceil(length / (speed * CONTROL_STEP)))  # control steps out, and as many back
-        self._count = 0  # control steps in the present phase
+        self._direction = np.array([math.cos(angle), math.sin(angle), 0.0])
+        self._length, self._speed = length, speed
+        self._time = 0.0  # since the present pair of strokes began
         self._patience = SHAKE_PATIENCE
 
     @property
@@ -145,22 +145,20 @@ class Shake:
         if self.phase is ShakePhase.APPROACH:
             self._tilt += self._tilt_rate
             if self._tilt > END_TILT:
-                self.phase, self._count = ShakePhase.STROKE, 0
+                self.phase = ShakePhase.STROKE
             return self._place(0.0)
 
         self._patience = SHAKE_PATIENCE if flowing else self._patience - CONTROL_STEP
-        self._count += 1
-        if self.phase is ShakePhase.STROKE:
-            out = (self._count - 1) % (2 * self._half) + 1
-            share = min(out, 2 * self._half - out) / self._half
-            if self._count == 4 * self._half:
-                self.phase, self._count = ShakePhase.PAUSE, 0
-            return self._place(share)
-        if self._count == PAUSE:
-            self.phase, self._count = ShakePhase.STROKE, 0
-        return self._place(0.0)
+        # Times are not rounded to control steps, so that what flows depends smoothly on speed and length.
+        pair = 4.0 * self._length / self._speed
+        self._time = (self._time + CONTROL_STEP) % (pair + PAUSE)
+        self.phase = ShakePhase.STROKE if self._time < pair else ShakePhase.PAUSE
+        if self.phase is ShakePhase.PAUSE:
+            return self._place(0.0)
+        way = (self._speed * self._time) % (2.0 * self._length)
+        return self._place(min(way, 2.0 * self._length - way))
 
-    def _place(self, share: float) -> np.ndarray:
-        command = self._start + share * self._stroke
+    def _place(self, distance: float) -> np.ndarray:
+        command = self._start + distance * self._direction
         command[2] = self._tilt
         return command

@@ -55,12 +55,11 @@ def attraction_share(material: str, skill: str) -> tuple[float, float]:
 def speed_up(episodes: int = 10, rounds: int = 2) -> tuple[float, float]:
     """Return the wall-clock times of the same episodes in one and in two processes, the better of the rounds."""
     times: dict[int, list[float]] = {1: [], 2: []}
-    run_episodes(
-        [({"material": "wat", "mouth": 0.25}, ACTIONS, "shake", 0)] * 2, 1, 2
-    )  # starts the processes
+    setup = {"material": "wat", "mouth": 0.25}
+    run_episodes([(setup, ACTIONS, "shake", 0)] * 2, 1, 2)  # starts the processes
     for number in range(rounds):
         seeds = range(100 * number, 100 * number + episodes)  # none has been settled before
-        jobs = [({"material": "wat", "mouth": 0.25}, ACTIONS, "shake", seed) for seed in seeds]
+        jobs = [(setup, ACTIONS, "shake", seed) for seed in seeds]
         for processes, taken in times.items():
             begin = time.perf_counter()
             run_episodes(jobs, 1, processes)

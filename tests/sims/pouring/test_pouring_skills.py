@@ -77,10 +77,11 @@ def test_shaking_turns_over_then_strokes_in_pairs():
         assert np.allclose(command[:2], START[:2])
     assert command[2] > END_TILT
     cycle = []
-    for _ in range(4 * 3 + PAUSE):  # 0.06 at 0.8 takes 3 control steps each way
+    pause = round(PAUSE / CONTROL_STEP)
+    for _ in range(4 * 3 + pause):  # 0.06 at 0.8 takes 3 control steps each way
         cycle.append(shake.next(True, False))
     depth = START[1] - np.array(cycle)[:, 1]
-    assert np.allclose(depth, [0.02, 0.04, 0.06, 0.04, 0.02, 0.0] * 2 + [0.0] * PAUSE)
+    assert np.allclose(depth, [0.02, 0.04, 0.06, 0.04, 0.02, 0.0] * 2 + [0.0] * pause)
     assert np.allclose(np.array(cycle)[:, 0], START[0])
     assert shake.next(True, False)[1] == pytest.approx(START[1] - 0.02)
 
@@ -97,3 +98,14 @@ def test_shaking_gives_up_three_time_units_after_the_last_flow():
         shake.next(False, False)
         steps += 1
     assert steps * CONTROL_STEP == pytest.approx(3.0, abs=2 * CONTROL_STEP)
+
+
+def test_shaking_depends_smoothly_on_speed_and_length():
+    def ways(speed, length):
+        shake = Shake(START, 0.02, speed, length, 0.0)
+        while shake.phase is ShakePhase.APPROACH:
+            shake.next(False, False)
+        return np.array([shake.next(True, False)[0] for _ in range(12)])
+
+    assert 0.0 < np.abs(ways(0.75, 0.06) - ways(0.751, 0.06)).max() < 1e-3
+    assert 0.0 < np.abs(ways(0.75, 0.06) - ways(0.75, 0.0601)).max() < 1e-3
