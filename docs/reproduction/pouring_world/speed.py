@@ -53,7 +53,7 @@ def attraction_share(material: str, skill: str) -> tuple[float, float]:
 
 
 def speed_up(episodes: int = 10, rounds: int = 2) -> tuple[float, float]:
-    """Return the wall-clock times of the same episodes in one and in two processes, the better of the rounds."""
+    """Return the wall-clock times of the same episodes in one and in two processes, best of the rounds."""
     times: dict[int, list[float]] = {1: [], 2: []}
     setup = {"material": "wat", "mouth": 0.25}
     run_episodes([(setup, ACTIONS, "shake", 0)] * 2, 1, 2)  # starts the processes
