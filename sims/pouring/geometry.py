@@ -65,13 +65,18 @@ class Source:
         )
 
     def contains(self, local: np.ndarray) -> np.ndarray:
-        """(n,) whether points in the local frame lie inside the box or between the plates of its lip."""
+        """(n,) whether points in the local frame lie inside the box or between the plates of its lip.
+
+        Contacts are soft, and fast spheres dip into the walls: inside is what the walls push back inside, which
+        they do up to their middle.
+        """
         z = local[:, 2]
-        half = SOURCE_WIDTH / 2 - np.maximum(0.0, z - SOURCE_HEIGHT)
+        lip = INNER - (z - SOURCE_HEIGHT) + LIP_WALL * math.sqrt(0.5)
+        half = np.where(z < SOURCE_HEIGHT, INNER + SOURCE_WALL / 2, lip)
         return (
             (np.abs(local[:, 0]) < half)
             & (np.abs(local[:, 1]) < half)
-            & (z > -WALL)
+            & (z > WALL - SOURCE_WALL / 2)
             & (z < SOURCE_HEIGHT + self.lip)
         )
 

@@ -122,3 +122,12 @@ def test_proper_ways_are_no_leaks(scene, before, after):
     census.leaked.clear()
     place(simulation, census, after)
     assert not census.leaked
+
+
+def test_a_dip_into_a_soft_wall_is_no_leak(scene):
+    simulation, census = scene
+    place(simulation, census, (0.12, 0.0, 0.2))
+    census.leaked.clear()
+    assert place(simulation, census, (0.155, 0.0, 0.2), (-0.4, 0.0, 0.0)) is SphereClass.SOURCE
+    assert place(simulation, census, (0.12, 0.0, 0.2)) is SphereClass.SOURCE
+    assert not census.leaked

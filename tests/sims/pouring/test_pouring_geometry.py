@@ -25,7 +25,7 @@ def test_inside_is_the_box_and_the_funnel():
     source = Source(0.11)
     height = SOURCE_HEIGHT + source.lip / 2
     inside = [(0, 0, 0.1), (0.14, -0.14, 0.4), (0.0, 0.0, height), (INNER - source.lip / 2, 0, height)]
-    outside = [(0.16, 0, 0.1), (0, 0, -0.02), (0, 0, 0.5 + source.lip + 0.01), (0.14, 0, height)]
+    outside = [(0.18, 0, 0.1), (0, 0, -0.03), (0, 0, 0.5 + source.lip + 0.01), (0.14, 0, height)]
     assert source.contains(np.array(inside)).all()
     assert not source.contains(np.array(outside)).any()
 
