@@ -67,8 +67,8 @@ class Source:
     def contains(self, local: np.ndarray) -> np.ndarray:
         """(n,) whether points in the local frame lie inside the box or between the plates of its lip.
 
-        Contacts are soft, and fast spheres dip into the walls: inside is what the walls push back inside, which
-        they do up to their middle.
+        Contacts are soft, and fast spheres dip into the walls: inside is what the walls push back inside,
+        which they do up to their middle.
         """
         z = local[:, 2]
         lip = INNER - (z - SOURCE_HEIGHT) + LIP_WALL * math.sqrt(0.5)
