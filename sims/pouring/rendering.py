@@ -1,0 +1,167 @@
+"""Pictures and videos of an episode, which need no screen, and MuJoCo's viewer where there is one."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import imageio.v3 as imageio
+import mujoco
+import numpy as np
+
+from sims.pouring.census import SphereClass
+from sims.pouring.geometry import SPHERES
+from sims.pouring.scene import CONTROL_STEP
+from sims.pouring.simulation import Simulation
+from sims.pouring.world import PouringWorld
+
+COLOURS = {
+    SphereClass.SOURCE: (0.20, 0.45, 0.95, 1.0),
+    SphereClass.FLOWING: (1.00, 0.75, 0.05, 1.0),
+    SphereClass.RECEIVED: (0.10, 0.65, 0.30, 1.0),
+    SphereClass.SPILLED: (0.90, 0.10, 0.10, 1.0),
+    SphereClass.BOUNCED: (0.55, 0.35, 0.75, 1.0),
+}
+
+
+class Camera:
+    """Draws a world's present moment from the side, spheres coloured by class.
+
+    Args:
+        world: What to draw.
+        width: Of the pictures [pixels].
+        height: Of the pictures [pixels].
+    """
+
+    def __init__(self, world: PouringWorld, width: int = 480, height: int = 480) -> None:
+        self._world = world
+        self._size = (height, width)
+        self._renderer: mujoco.Renderer | None = None
+        self._data: mujoco.MjData | None = None
+
+    def picture(self) -> np.ndarray:
+        """Return the present moment as (height, width, 3) bytes."""
+        simulation = self._world.behaviour.simulation
+        renderer, data = self._prepare(simulation)
+        data.qpos[:] = simulation.data.qpos
+        mujoco.mj_kinematics(simulation.model, data)
+        mujoco.mj_camlight(simulation.model, data)
+        view = mujoco.MjvCamera()
+        view.lookat[:] = [float(simulation.receiver_pose[0]) - 0.2, 0.0, 0.36]
+        view.distance, view.azimuth, view.elevation = 1.75, 90.0, -10.0
+        renderer.update_scene(data, camera=view)
+        paint(renderer.scene, simulation.model, self._world.behaviour.census.classes)
+        return renderer.render().copy()
+
+    def _prepare(self, simulation: Simulation) -> tuple[mujoco.Renderer, mujoco.MjData]:
+        """Return a renderer for the present model, and data of its own, so that drawing disturbs nothing."""
+        if self._renderer is None or self._data is None or self._renderer.model is not simulation.model:
+            self.close()
+            self._renderer = mujoco.Renderer(simulation.model, *self._size)
+            self._data = mujoco.MjData(simulation.model)
+        return self._renderer, self._data
+
+    def close(self) -> None:
+        """Free what the graphics system holds."""
+        if self._renderer is not None:
+            self._renderer.close()
+        self._renderer = self._data = None
+
+
+def paint(scene: mujoco.MjvScene, model: mujoco.MjModel, classes: np.ndarray) -> None:
+    """Colour the spheres of a scene by their classes."""
+    first = model.ngeom - SPHERES  # the spheres are the last geoms of the model
+    for geom in scene.geoms[: scene.ngeom]:
+        if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.objid >= first:
+            geom.rgba = COLOURS[SphereClass(classes[geom.objid - first])]
+
+
+@contextmanager
+def film(world: PouringWorld, camera: Camera, every: int = 8) -> Iterator[list[np.ndarray]]:
+    """Collect a picture of the world every so many control steps while the block runs.
+
+    Args:
+        world: Whose present episode is filmed; reset it before.
+        camera: That draws it.
+        every: Control steps from one picture to the next; 2 fills 20 pictures per unit of simulated time.
+    """
+    frames: list[np.ndarray] = []
+    steps = 0
+
+    def look(simulation: Simulation) -> None:
+        nonlocal steps
+        if steps % every == 0:
+            frames.append(camera.picture())
+        steps += 1
+
+    listeners = world.behaviour.simulation.listeners
+    listeners.append(look)
+    try:
+        yield frames
+    finally:
+        listeners.remove(look)
+
+
+def strip(frames: Sequence[np.ndarray], count: int = 6) -> np.ndarray:
+    """Return `count` pictures, evenly spread over the frames, side by side as one picture."""
+    chosen = np.linspace(0, len(frames) - 1, count).round().astype(int)
+    return np.concatenate([frames[index] for index in chosen], axis=1)
+
+
+def write_picture(path: str | Path, picture: np.ndarray) -> None:
+    """Write a picture; the ending of the name says how."""
+    imageio.imwrite(path, picture)
+
+
+def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> None:
+    """Write frames as .mp4 or .gif.
+
+    Args:
+        path: Where to; the ending says which.
+        frames: Pictures of equal size, with even width and height for .mp4.
+        fps: Pictures a second.
+
+    Raises:
+        ValueError: The ending is neither .mp4 nor .gif.
+    """
+    ending = Path(path).suffix
+    if ending == ".mp4":
+        imageio.imwrite(path, np.stack(frames), fps=fps, codec="libx264", macro_block_size=2)
+    elif ending == ".gif":
+        imageio.imwrite(path, np.stack(frames), duration=1000.0 / fps, loop=0)
+    else:
+        raise ValueError(f"video: {str(path)!r} ends in neither .mp4 nor .gif; choose one of these")
+
+
+@contextmanager
+def viewer(world: PouringWorld, speed: float = 1.0) -> Iterator[None]:
+    """Show the world in MuJoCo's interactive viewer while the block runs; this needs a screen.
+
+    Args:
+        world: Whose present episode is shown; reset it before.
+        speed: Simulated time per second.
+
+    Raises:
+        RuntimeError: There is no screen.
+    """
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        # MuJoCo would end the whole process instead of raising.
+        raise RuntimeError("viewer: there is no screen (DISPLAY is not set); use film and write_video")
+    import mujoco.viewer  # it needs a screen already when it is imported
+
+    simulation = world.behaviour.simulation
+    with mujoco.viewer.launch_passive(simulation.model, simulation.data) as window:
+
+        def show(simulation: Simulation) -> None:
+            window.sync()
+            time.sleep(CONTROL_STEP / speed)
+
+        simulation.listeners.append(show)
+        try:
+            yield
+        finally:
+            simulation.listeners.remove(show)

@@ -1,0 +1,66 @@
+"""Pictures and videos: they show the classes, disturb nothing and reach the disk."""
+
+import sys
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+
+from sims.pouring import PouringWorld
+from sims.pouring.census import SphereClass
+from sims.pouring.rendering import Camera, film, strip, viewer, write_picture, write_video
+
+
+@pytest.fixture
+def world():
+    world = PouringWorld("wat", 0.25, receiver_x=0.6)
+    world.reset(0)
+    return world
+
+
+def test_pictures_show_the_classes_and_disturb_nothing(world):
+    camera = Camera(world, 160, 160)
+    before = world.behaviour.simulation.save().physics
+    first = camera.picture()
+    assert first.shape == (160, 160, 3) and first.dtype == np.uint8
+    assert np.array_equal(first, camera.picture())
+    world.behaviour.census.classes[:] = SphereClass.SPILLED
+    reddened = camera.picture().astype(int) - first
+    assert (reddened[..., 0] > 50).sum() > 100 and (reddened[..., 2] < -50).sum() > 100
+    assert np.array_equal(world.behaviour.simulation.save().physics, before)
+    camera.close()
+
+
+def test_a_camera_follows_its_world_into_another_scene(world):
+    camera = Camera(world, 160, 160)
+    first = camera.picture()
+    world._mouth = (0.11, 0.11)
+    world.reset(0)
+    assert not np.array_equal(camera.picture(), first)
+    camera.close()
+
+
+def test_a_film_becomes_a_strip_and_a_video(world, tmp_path):
+    camera = Camera(world, 160, 160)
+    world.execute("start", {"grasp_ratio": 0.5})
+    with film(world, camera, every=10) as frames:
+        world.execute("grasped", {})
+    assert not world.behaviour.simulation.listeners
+    assert len(frames) > 3
+    assert strip(frames, 4).shape == (160, 640, 3)
+    write_picture(tmp_path / "strip.png", strip(frames, 4))
+    assert imageio.imread(tmp_path / "strip.png").shape == (160, 640, 3)
+    for ending in ("mp4", "gif"):
+        write_video(tmp_path / f"film.{ending}", frames, fps=10)
+        assert len(list(imageio.imiter(tmp_path / f"film.{ending}"))) == len(frames)
+    with pytest.raises(ValueError, match="ends in neither .mp4 nor .gif"):
+        write_video(tmp_path / "film.avi", frames, fps=10)
+    camera.close()
+
+
+def test_a_missing_screen_is_named(world, monkeypatch):
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(RuntimeError, match="there is no screen"), viewer(world):
+        pass

@@ -1,0 +1,340 @@
+"""The world's protocol: nodes and labels, clamps, failures, determinism, save and restore."""
+
+import hashlib
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from sims.pouring import ACTIONS, End, Material, PouringWorld, SimulationFailed, behaviour
+from sims.pouring.behaviour import TRANSITIONS, Phase
+
+ACTION = {
+    "grasp_ratio": 0.3,
+    "pour_position": (-0.2, 0.33),
+    "tilt_rate": 0.02,
+    "search_rate": 0.005,
+    "shake_speed": 0.75,
+    "shake_stroke": (0.06, -1.57),
+}
+# Sizes of what is observed at the start and on every edge: the inputs and outputs of the paper's edge models.
+START_SIZES = {
+    "receiver_corners": 12,
+    "waypoint": 2,
+    "position": 3,
+    "poured": 1,
+    "spilled": 1,
+    "released": 1,
+    "target": 1,
+    "target_change": 1,
+    "mouth": 1,
+    "material": 4,
+}
+EDGE_SIZES = {
+    "grasped": {"grasp_height": 1},
+    "at_receiver": {"receiver_corners": 12, "position": 3},
+    "receiver_moved": {"receiver_corner_change": 12, "receiver_speed": 1},
+    "at_pour": {"relative_position": 3},
+    "ready": {},
+    "shaken": {"released_change": 1, "flow_centre": 2, "flow_variance": 1},
+    "poured": {"poured_change": 1, "spilled_change": 1},
+}
+
+
+def sizes(observed):
+    return {label: np.size(value) for label, value in observed.items()}
+
+
+def digest(world):
+    return hashlib.sha256(world.behaviour.simulation.data.qpos.tobytes()).hexdigest()
+
+
+def advance(world, until, skill="shake", actions=ACTION):
+    """Execute node after node up to one; return all that was observed on the way, node -> observation."""
+    seen = {}
+    while world.node != until:
+        seen |= world.execute(world.node, actions, {"skill": skill})
+    return seen
+
+
+@pytest.fixture(scope="module")
+def shaken():
+    """A world that has poured water through a wide mouth, and what it observed on every edge."""
+    world = PouringWorld("wat", 0.25, receiver_x=0.7)
+    start = world.reset(5)
+    return world, start, advance(world, "poured")
+
+
+def test_every_edge_observes_its_labels(shaken):
+    _, start, seen = shaken
+    assert sizes(start) == START_SIZES
+    assert {node: sizes(observed) for node, observed in seen.items()} == EDGE_SIZES
+    scalars = [
+        value for observed in (start, *seen.values()) for value in observed.values() if np.size(value) == 1
+    ]
+    assert all(isinstance(value, float) for value in scalars)
+
+
+def test_what_is_observed_agrees_with_itself(shaken):
+    world, start, seen = shaken
+    assert start["target"] == start["target_change"] == 0.3
+    assert start["receiver_corners"].reshape(4, 3).mean(axis=0) == pytest.approx([0.7, 0.0, 0.2])
+    assert start["waypoint"] == pytest.approx([0.4, 0.55])
+    assert seen["grasped"]["grasp_height"] == pytest.approx(0.05 + 0.3 * 0.4)
+    assert seen["at_receiver"]["position"] == pytest.approx([0.4, 0.0, 0.55], abs=0.01)
+    assert seen["at_pour"]["relative_position"] == pytest.approx([-0.2, 0.0, 0.13], abs=0.01)
+    assert seen["receiver_moved"]["receiver_corner_change"] == pytest.approx(np.zeros(12), abs=1e-6)
+    census = world.behaviour.census
+    assert seen["poured"]["poured_change"] == pytest.approx(0.0055 * census.in_receiver)
+    assert seen["poured"]["poured_change"] > 0.3
+    assert seen["poured"]["spilled_change"] == pytest.approx(0.1 * census.spilled)
+    assert seen["shaken"]["released_change"] >= seen["poured"]["poured_change"]
+    assert np.abs(seen["shaken"]["flow_centre"]).max() < 0.1
+    assert 0.0 < seen["shaken"]["flow_variance"] < 0.05
+    assert not census.leaked
+    assert world.metrics["fraction_in_receiver"] == census.in_receiver / 100
+
+
+def test_an_episode_ends_when_the_target_is_reached(shaken):
+    world, _, _ = shaken
+    assert world.execute("poured", {}) == {}
+    assert world.end is End.TARGET
+    with pytest.raises(ValueError, match="the episode is over .target reached.; call reset"):
+        world.execute("poured", {})
+
+
+def test_transitions_are_those_of_the_behaviour():
+    assert set(TRANSITIONS) == set(Phase)
+    assert TRANSITIONS[Phase.READY] == (Phase.TIPPED, Phase.SHAKEN)
+    assert TRANSITIONS[Phase.POURED] == (Phase.AT_RECEIVER,)
+
+
+def test_the_trial_loop_goes_on_where_the_target_is_missed():
+    world = PouringWorld("vsc", 0.11, target=0.02, receiver_x=0.7)
+    world.reset(0)
+    # Straight over the rim nothing can be poured from so far away.
+    seen = advance(world, "poured", "tip", ACTION | {"pour_position": (-0.35, 0.55)})
+    assert world.behaviour.trial.stopped == "no flow"
+    again = world.execute("poured", {})["at_receiver"]
+    assert sizes(again) == {
+        "receiver_corners": 12,
+        "position": 3,
+        "poured": 1,
+        "spilled": 1,
+        "released": 1,
+        "target_change": 1,
+    }
+    assert world.node == "at_receiver"
+    assert again["target_change"] == pytest.approx(0.02 - again["poured"])
+    assert again["released"] == pytest.approx(seen["tipped"]["released_change"])
+
+
+def test_a_stuck_attempt_ends_early_with_the_same_outcome(monkeypatch):
+    outcomes = []
+    for speed in (behaviour.REST_SPEED, 0.0):  # at speed 0 nothing ever counts as resting
+        monkeypatch.setattr(behaviour, "REST_SPEED", speed)
+        world = PouringWorld("vsc+", 0.13, receiver_x=0.7)
+        world.reset(1)
+        advance(world, "poured", "tip")
+        census = world.behaviour.census
+        outcomes.append((census.in_receiver, census.spilled, census.in_source, world.behaviour.trial.stopped))
+        monkeypatch.undo()
+    assert outcomes[0] == outcomes[1]
+    assert outcomes[0][3] == "no flow"
+
+
+def test_the_time_limit_ends_the_episode():
+    world = PouringWorld("vsc+", 0.11, receiver_x=0.7, time_limit=6.0)
+    world.reset(0)
+    advance(world, "poured", "tip")
+    assert world.behaviour.trial.stopped == "time"
+    assert world.execute("poured", {}) == {}
+    assert world.end is End.TIME
+
+
+def test_commands_outside_the_bounds_are_clamped_and_reported():
+    world = PouringWorld("wat", 0.25, receiver_x=0.7)
+    world.reset(0)
+    observed = world.execute("start", {"grasp_ratio": 7.0})
+    assert observed["grasped"]["grasp_height"] == pytest.approx(0.45)
+    world.execute("grasped", {})
+    observed = world.execute("at_receiver", {"pour_position": (-9.0, -9.0)})
+    assert observed["at_pour"]["relative_position"] == pytest.approx([-0.35, 0.0, 0.12], abs=0.01)
+    assert [(clamp.label, clamp.asked, clamp.used) for clamp in world.clamps] == [
+        ("grasp_ratio", (7.0,), (1.0,)),
+        ("pour_position", (-9.0, -9.0), (-0.35, 0.32)),
+    ]
+
+
+def test_a_source_that_would_hit_the_receiver_is_raised_and_reported():
+    world = PouringWorld("wat", 0.25, receiver_x=0.7, time_limit=12.0)
+    world.reset(0)
+    advance(world, "ready", actions=ACTION | {"pour_position": (-0.3, 0.32)})
+    world.execute("ready", ACTION | {"shake_stroke": (0.1, -1.57)}, {"skill": "shake"})
+    lifts = [clamp.used[0] for clamp in world.clamps if clamp.label == "lift"]
+    assert lifts and 0.0 < max(lifts) < 0.2
+
+
+def test_a_push_moves_the_receiver():
+    world = PouringWorld("wat", 0.25, receiver_x=0.7)
+    world.reset(0)
+    advance(world, "tipped", "tip", ACTION | {"grasp_ratio": 0.5, "pour_position": (0.0, 0.32)})
+    assert world.behaviour.simulation.receiver_pose[0] > 0.71
+
+
+@pytest.mark.parametrize(
+    ("node", "actions", "selections", "words"),
+    [
+        ("ready", {}, {}, "the episode stands at 'start'"),
+        ("start", {"grasp": 0.5}, {}, r"action 'grasp_ratio' is missing; given are \['grasp'\]"),
+        ("start", {"grasp_ratio": float("nan")}, {}, "give finite numbers"),
+        ("start", {"grasp_ratio": (0.1, 0.2)}, {}, r"has shape \(2,\); give 1 number"),
+    ],
+)
+def test_wrong_calls_are_named_and_change_nothing(node, actions, selections, words):
+    world = PouringWorld("wat", 0.25, receiver_x=0.7)
+    world.reset(0)
+    before = digest(world)
+    with pytest.raises(ValueError, match=words):
+        world.execute(node, actions, selections)
+    assert world.node == "start" and digest(world) == before
+
+
+def test_an_unknown_skill_is_named():
+    world = PouringWorld("wat", 0.25, receiver_x=0.7)
+    world.reset(0)
+    advance(world, "ready")
+    with pytest.raises(ValueError, match=r"'skill' is 'stir'; choose from \['tip', 'shake'\]"):
+        world.execute("ready", ACTION, {"skill": "stir"})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"mouth": 0.3}, "mouth: 0.3 is not a number or .low, high. from 0.11 to 0.25"),
+        ({"target": (0.4, 0.2)}, "target"),
+        ({"material": ()}, "give at least one material"),
+        ({"receiver_x": 2.0}, "receiver_x"),
+    ],
+)
+def test_wrong_arguments_are_named(arguments, words):
+    with pytest.raises(ValueError, match=words):
+        PouringWorld(**arguments)
+
+
+def test_a_world_that_has_not_begun_says_so():
+    world = PouringWorld()
+    with pytest.raises(ValueError, match="call reset"):
+        world.execute("start", ACTION)
+    world.reset(0)
+    world.close()
+    with pytest.raises(ValueError, match="call reset"):
+        world.node  # noqa: B018
+
+
+def test_resets_draw_what_is_not_fixed():
+    world = PouringWorld(("wat", "vsc", Material(0.5, 0.2, 0.0, 0.1)), (0.11, 0.25), (0.2, 0.4))
+    starts = [world.reset(seed) for seed in range(6)]
+    assert len({start["mouth"] for start in starts}) == 6
+    assert all(0.2 <= start["target"] <= 0.4 for start in starts)
+    assert len({start["material"][0] for start in starts}) > 1
+    fixed = PouringWorld("wat", (0.11, 0.25), 0.3).reset(3)
+    assert fixed["mouth"] == starts[3]["mouth"]
+    assert np.array_equal(fixed["receiver_corners"], starts[3]["receiver_corners"])
+
+
+def test_a_failed_simulation_ends_the_episode_with_what_was_measured():
+    world = PouringWorld("wat", 0.25, receiver_x=0.7)
+    world.reset(0)
+    advance(world, "ready")
+
+    def break_physics(simulation):
+        if world.behaviour.census.flowing > 3:
+            simulation.velocities[0, 0] = np.nan
+
+    world.behaviour.simulation.listeners.append(break_physics)
+    with pytest.raises(SimulationFailed, match="not finite at time") as failure:
+        world.execute("ready", ACTION, {"skill": "shake"})
+    assert world.end is End.FAILED
+    observed = failure.value.observed
+    assert {"poured", "spilled", "released", "released_change", "poured_change"} <= set(observed)
+    assert observed["released"] > 0.0
+    assert all(np.isfinite(value).all() for value in observed.values())
+    with pytest.raises(ValueError, match="simulation failed"):
+        world.execute("ready", ACTION, {"skill": "shake"})
+    world.reset(0)
+    assert world.end is None
+
+
+def test_the_same_seed_gives_the_same_episode_here_and_in_another_process(shaken):
+    world, _, _ = shaken
+    again = PouringWorld("wat", 0.25, receiver_x=0.7)
+    again.reset(5)
+    advance(again, "poured")
+    assert digest(again) == digest(world)
+    script = f"""
+import hashlib
+import pickle
+from sims.pouring import PouringWorld
+world = PouringWorld("wat", 0.25, receiver_x=0.7)
+world.reset(5)
+while world.node != "poured":
+    world.execute(world.node, {ACTION!r}, {{"skill": "shake"}})
+print(hashlib.sha256(world.behaviour.simulation.data.qpos.tobytes()).hexdigest())
+"""
+    other = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert other.stdout.strip() == digest(world)
+
+
+def test_other_seeds_give_other_episodes():
+    world = PouringWorld("wat", 0.25, receiver_x=0.7)
+    world.reset(5)
+    first = digest(world)
+    world.reset(6)
+    assert digest(world) != first
+
+
+def test_an_episode_goes_on_from_a_saved_state(shaken):
+    world, _, _ = shaken
+    other = PouringWorld("wat", 0.25, receiver_x=0.7)
+    other.reset(5)
+    advance(other, "ready")
+    saved = pickle.loads(pickle.dumps(other.save()))
+    advance(other, "poured")
+    fresh = PouringWorld("bnc", 0.12)  # another world, which takes over everything
+    fresh.restore(saved)
+    assert fresh.node == "ready"
+    observed = advance(fresh, "poured")
+    assert digest(fresh) == digest(other) == digest(world)
+    assert observed["poured"]["poured_change"] == pytest.approx(0.0055 * world.behaviour.census.in_receiver)
+
+
+def test_physics_goes_on_from_a_state_saved_within_a_skill():
+    world = PouringWorld("vsc", 0.2, receiver_x=0.7, time_limit=9.0)
+    world.reset(0)
+    simulation = world.behaviour.simulation
+    saved, commands = [], []
+
+    def record(simulation):
+        if simulation.time > 7.0:
+            commands.append(simulation.command.copy())
+            if not saved:
+                saved.append(simulation.save())
+                commands.clear()
+
+    simulation.listeners.append(record)
+    advance(world, "shaken")
+    end = simulation.data.qpos.copy()
+    simulation.listeners.clear()
+    simulation.restore(saved[0])
+    for command in commands:
+        simulation.step(command)
+    assert np.array_equal(simulation.data.qpos, end)
+
+
+def test_bounds_and_shares_of_bounds_agree():
+    for bounds in ACTIONS.values():
+        assert np.allclose(bounds.scale(np.zeros(len(bounds.low))), bounds.low)
+        assert np.allclose(bounds.scale(np.ones(len(bounds.low))), bounds.high)
