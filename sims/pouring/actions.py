@@ -77,9 +77,7 @@ def read_action(node: str, actions: Mapping[str, ArrayLike], label: str, clamps:
     bounds = ACTIONS[label]
     value = np.atleast_1d(np.asarray(actions[label], dtype=float))
     if value.shape != (len(bounds.low),):
-        raise ValueError(
-            f"node {node!r}: action {label!r} has shape {value.shape}; give {len(bounds.low)} number(s)"
-        )
+        raise ValueError(f"node {node!r}: action {label!r} has shape {value.shape}; give {len(bounds.low)} number(s)")
     if not np.isfinite(value).all():
         raise ValueError(f"node {node!r}: action {label!r} is {value.tolist()}; give finite numbers")
     used = np.clip(value, bounds.low, bounds.high)

@@ -141,9 +141,7 @@ class Behaviour:
     @property
     def waypoint(self) -> np.ndarray:
         """(2,) x and z of the shoulder before and after a trial."""
-        return np.array(
-            [self.simulation.receiver_pose[0] + WAYPOINT[0], self.simulation.receiver.rim + WAYPOINT[1]]
-        )
+        return np.array([self.simulation.receiver_pose[0] + WAYPOINT[0], self.simulation.receiver.rim + WAYPOINT[1]])
 
     def grasp(self, ratio: float) -> float:
         """Hold the source at a share of its height; return the height of the grasp [length]."""
@@ -229,9 +227,7 @@ class Behaviour:
             rested = rested + 1 if fastest < REST_SPEED else 0
         self.trial.stopped = "no flow" if skill.ended else stopped
         self.trial.duration = simulation.time - begin
-        self.trial.mouth = simulation.source.mouth_centre(simulation.pose) - float(
-            simulation.receiver_pose[0]
-        )
+        self.trial.mouth = simulation.source.mouth_centre(simulation.pose) - float(simulation.receiver_pose[0])
         tilted = np.array([*place[:2], simulation.command[2]])
         back = Move(tilted, place, CARRY_SPEED, RETURN_TILT_SPEED)
         while not back.ended or simulation.distance_to_goal > ARRIVED:

@@ -59,10 +59,7 @@ class PouringEnv(gymnasium.Env):
         self._camera: Any = None
         self.action_space = spaces.Dict(
             {"skill": spaces.Discrete(len(SKILLS))}
-            | {
-                label: spaces.Box(0.0, 1.0, (len(bounds.low),), np.float32)
-                for label, bounds in ACTIONS.items()
-            }
+            | {label: spaces.Box(0.0, 1.0, (len(bounds.low),), np.float32) for label, bounds in ACTIONS.items()}
         )
         self.observation_space = spaces.Dict(
             {label: spaces.Box(low, high, (size,), np.float32) for label, (size, low, high) in SEEN.items()}
@@ -119,9 +116,7 @@ class PouringEnv(gymnasium.Env):
 
     def _situation(self) -> Observation:
         behaviour = self._world.behaviour
-        return observation.setting(behaviour, behaviour.target) | observation.situation(
-            behaviour, behaviour.target
-        )
+        return observation.setting(behaviour, behaviour.target) | observation.situation(behaviour, behaviour.target)
 
     def _see(self, known: Observation) -> dict[str, np.ndarray]:
         return {

@@ -60,9 +60,7 @@ class Source:
         """(n, 3) points in the frame of the box's bottom centre, for a shoulder at (x, z, tilt)."""
         cos, sin = math.cos(pose[2]), math.sin(pose[2])
         x, z = points[:, 0] - pose[0], points[:, 2] - pose[1]
-        return np.stack(
-            [cos * x - sin * z + SOURCE_WIDTH / 2, points[:, 1], sin * x + cos * z + SOURCE_HEIGHT], axis=1
-        )
+        return np.stack([cos * x - sin * z + SOURCE_WIDTH / 2, points[:, 1], sin * x + cos * z + SOURCE_HEIGHT], axis=1)
 
     def contains(self, local: np.ndarray) -> np.ndarray:
         """(n,) whether points in the local frame lie inside the box or between the plates of its lip.
@@ -105,9 +103,7 @@ class Source:
             ]
         )
         ends = np.roll(corners, -1, axis=0)
-        points = [
-            a + (b - a) * t for a, b in zip(corners, ends, strict=True) for t in np.linspace(0, 1, 8)[:-1]
-        ]
+        points = [a + (b - a) * t for a, b in zip(corners, ends, strict=True) for t in np.linspace(0, 1, 8)[:-1]]
         return np.array(points) - (SOURCE_WIDTH / 2, SOURCE_HEIGHT)
 
     def mouth_centre(self, pose: np.ndarray) -> float:

@@ -63,9 +63,7 @@ def find_material(material: str | Material) -> Material:
     if isinstance(material, Material):
         return material
     if material not in MATERIALS:
-        raise ValueError(
-            f"material: there is no {material!r}; choose from {list(MATERIALS)} or pass a Material"
-        )
+        raise ValueError(f"material: there is no {material!r}; choose from {list(MATERIALS)} or pass a Material")
     return MATERIALS[material]
 
 

@@ -116,9 +116,7 @@ def _kinematic_joint(kind: str, axis: str) -> str:
     return f'<joint type="{kind}" axis="{axis}" armature="{KINEMATIC_INERTIA}"/>'
 
 
-def _box(
-    kind: str, centre: tuple[float, float, float], half: tuple[float, float, float], turn: str = "0 0 0"
-) -> str:
+def _box(kind: str, centre: tuple[float, float, float], half: tuple[float, float, float], turn: str = "0 0 0") -> str:
     pos, size = (" ".join(f"{value:.9g}" for value in triple) for triple in (centre, half))
     return f'<geom class="{kind}" type="box" pos="{pos}" size="{size}" euler="{turn}"/>'
 
@@ -136,18 +134,14 @@ def _source_geoms(source: Source) -> str:
     side = INNER + half
     boxes = [_box("source", (x0, 0, z0 + WALL - half), (out, out, half))]
     for sign in (1, -1):
-        boxes.append(
-            _box("source", (x0 + sign * side, 0, -SOURCE_HEIGHT / 2), (half, out, SOURCE_HEIGHT / 2))
-        )
+        boxes.append(_box("source", (x0 + sign * side, 0, -SOURCE_HEIGHT / 2), (half, out, SOURCE_HEIGHT / 2)))
         boxes.append(_box("source", (x0, sign * side, -SOURCE_HEIGHT / 2), (out, half, SOURCE_HEIGHT / 2)))
     length, thickness = source.lip / math.sqrt(2), LIP_WALL / 2
     across = INNER - source.lip / 2 + thickness * math.sqrt(0.5)
     height = source.lip / 2 + thickness * math.sqrt(0.5)
     for sign in (1, -1):
         lean = sign * math.pi / 4
-        boxes.append(
-            _box("source", (x0 + sign * across, 0, height), (length, INNER, thickness), f"0 {lean} 0")
-        )
+        boxes.append(_box("source", (x0 + sign * across, 0, height), (length, INNER, thickness), f"0 {lean} 0"))
         boxes.append(_box("source", (x0, sign * across, height), (INNER, length, thickness), f"{-lean} 0 0"))
     return "".join(boxes)
 
@@ -155,9 +149,7 @@ def _source_geoms(source: Source) -> str:
 def _gripper_geoms() -> str:
     length, width, height = GRIPPER_SIZE
     across = SOURCE_WIDTH / 2 + WALL + length / 2
-    return "".join(
-        _box("gripper", (sign * across, 0, 0), (length / 2, width / 2, height / 2)) for sign in (1, -1)
-    )
+    return "".join(_box("gripper", (sign * across, 0, 0), (length / 2, width / 2, height / 2)) for sign in (1, -1))
 
 
 def _receiver_geoms(receiver: Receiver) -> str:

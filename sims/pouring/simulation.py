@@ -117,9 +117,7 @@ class Simulation:
         pitch = 2.1 * SPHERE_RADIUS
         edge = INNER - pitch / 2
         places = np.linspace(-edge, edge, 5)
-        z, y, x = np.meshgrid(
-            WALL + pitch / 2 + pitch * np.arange(SPHERES // 25), places, places, indexing="ij"
-        )
+        z, y, x = np.meshgrid(WALL + pitch / 2 + pitch * np.arange(SPHERES // 25), places, places, indexing="ij")
         layers = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
         layers += generator.uniform(-1e-3, 1e-3, layers.shape)
         self.data.qpos[_RECEIVER] = [receiver_x, 0.0, 0.0]

@@ -122,9 +122,7 @@ class Shake:
         angle: Direction of a stroke, 0 towards the receiver, pi/2 upwards [rad].
     """
 
-    def __init__(
-        self, start: np.ndarray, tilt_rate: float, speed: float, length: float, angle: float
-    ) -> None:
+    def __init__(self, start: np.ndarray, tilt_rate: float, speed: float, length: float, angle: float) -> None:
         self.phase = ShakePhase.APPROACH
         self._start = np.array(start, dtype=float)
         self._tilt = float(start[2])

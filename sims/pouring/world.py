@@ -39,12 +39,12 @@ class WorldState:
 
 
 class PouringWorld:
-    """Pour 100 spheres from a source with a narrow mouth into a receiver, by tipping or by shaking.
+    r"""Pour 100 spheres from a source with a narrow mouth into a receiver, by tipping or by shaking.
 
     An episode goes from node to node::
 
         start -> grasped -> at_receiver -> at_pour -> ready -> tipped | shaken -> poured -> at_receiver ...
-                       \\-> receiver_moved
+                       \-> receiver_moved
 
     `reset` returns what is observed at "start"; `execute` does what leaves a node and returns what was
     observed on the way to each node that it leads to. After "poured", the trial loop leads to "at_receiver"
@@ -112,9 +112,7 @@ class PouringWorld:
         self.clamps, self.end = [], None
         return observation.setting(self.behaviour, target) | observation.situation(self.behaviour, target)
 
-    def execute(
-        self, node: str, actions: Actions, selections: Selections | None = None
-    ) -> dict[str, Observation]:
+    def execute(self, node: str, actions: Actions, selections: Selections | None = None) -> dict[str, Observation]:
         """Do what leaves a node.
 
         Args:
@@ -237,9 +235,7 @@ class PouringWorld:
                 float(read("tilt_rate")[0]), float(read("shake_speed")[0]), float(length), float(angle)
             )
         else:
-            raise ValueError(
-                f"node {self.node!r}: selection 'skill' is {skill!r}; choose from {list(SKILLS)}"
-            )
+            raise ValueError(f"node {self.node!r}: selection 'skill' is {skill!r}; choose from {list(SKILLS)}")
         return {self.node: observation.flow(self.behaviour)}
 
     def _measure(self, actions: Actions, selections: Selections) -> dict[str, Observation]:
@@ -266,9 +262,7 @@ _EDGES = {
 }
 
 
-def _check_range(
-    name: str, value: float | tuple[float, float], limits: tuple[float, float]
-) -> tuple[float, float]:
+def _check_range(name: str, value: float | tuple[float, float], limits: tuple[float, float]) -> tuple[float, float]:
     low, high = value if isinstance(value, tuple) else (value, value)
     if not limits[0] <= low <= high <= limits[1]:
         raise ValueError(f"{name}: {value!r} is not a number or (low, high) from {limits[0]} to {limits[1]}")
@@ -276,9 +270,7 @@ def _check_range(
 
 
 @functools.lru_cache(maxsize=256)
-def _settle(
-    material: Material, source: Source, receiver: Receiver, receiver_x: float, seed: int
-) -> SimulationState:
+def _settle(material: Material, source: Source, receiver: Receiver, receiver_x: float, seed: int) -> SimulationState:
     """Return the state in which the spheres, dropped into the upright source, have come to rest."""
     simulation = Simulation(material, source, receiver)
     simulation.fill(receiver_x, np.random.default_rng([seed, 1]))

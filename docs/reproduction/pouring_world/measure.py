@@ -132,9 +132,7 @@ def perform(attempt: Attempt) -> dict[str, object]:
         "flow_variance": round(float(measured["flow_variance"]), 5),
         "leaked": len(census.leaked),
         "slowed": simulation.slowed,
-        "lift": round(
-            max([clamp.used[0] for clamp in world.clamps if clamp.label == "lift"], default=0.0), 4
-        ),
+        "lift": round(max([clamp.used[0] for clamp in world.clamps if clamp.label == "lift"], default=0.0), 4),
         "failed": failed,
         "digest": hashlib.sha256(simulation.data.qpos.tobytes()).hexdigest()[:16],
     }
@@ -170,10 +168,7 @@ def extremes() -> Iterator[Attempt]:
         for skill in SKILLS:
             name = str(generator.choice(list(MATERIALS)))
             mouth = round(float(generator.uniform(0.11, 0.25)), 4)
-            drawn = {
-                label: generator.uniform(bounds.low, bounds.high).round(4)
-                for label, bounds in ACTIONS.items()
-            }
+            drawn = {label: generator.uniform(bounds.low, bounds.high).round(4) for label, bounds in ACTIONS.items()}
             actions = {label: tuple(v.tolist()) if len(v) > 1 else float(v[0]) for label, v in drawn.items()}
             yield Attempt(f"random {number}", MATERIALS[name], name, mouth, skill, actions, number)
 
@@ -193,9 +188,7 @@ def dependence() -> Iterator[Attempt]:
     variations += [("tip", {**tip, "pour_position": (-0.19, z)}) for z in (0.38, 0.43, 0.48)]
     variations += [("shake", {**shake, "shake_speed": speed}) for speed in (0.70, 0.80, 0.90)]
     variations += [("shake", {**shake, "shake_stroke": (length, -1.5708)}) for length in (0.05, 0.08, 0.10)]
-    variations += [
-        ("shake", {**shake, "shake_stroke": (0.06, angle)}) for angle in (-0.7854, 0.0, 0.7854, 1.5708)
-    ]
+    variations += [("shake", {**shake, "shake_stroke": (0.06, angle)}) for angle in (-0.7854, 0.0, 0.7854, 1.5708)]
     variations += [("shake", {**shake, "pour_position": (x, 0.33)}) for x in (-0.30, -0.25, -0.15, -0.10)]
     setups = {"tip": ("bnc", 0.23), "shake": ("vsc", 0.13)}
     for seed in range(10):
@@ -254,9 +247,7 @@ def measure(name: str, attempts: Iterator[Attempt]) -> None:
                 file.flush()
 
 
-EXPERIMENTS = {
-    function.__name__: function for function in (table, jamming, extremes, again, dependence, best)
-}
+EXPERIMENTS = {function.__name__: function for function in (table, jamming, extremes, again, dependence, best)}
 
 Experiment = enum.StrEnum("Experiment", list(EXPERIMENTS))
 

@@ -11,9 +11,9 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-import matplotlib
+import matplotlib as mpl
 
-matplotlib.use("Agg")
+mpl.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -79,9 +79,7 @@ def table() -> None:
                 values = [column(groups[material, mouth, skill], name) for mouth in mouths]
                 mean = [value.mean() for value in values]
                 part.plot(mouths, mean, color=colour, label=skill)
-                part.fill_between(
-                    mouths, [v.min() for v in values], [v.max() for v in values], color=colour, alpha=0.2
-                )
+                part.fill_between(mouths, [v.min() for v in values], [v.max() for v in values], color=colour, alpha=0.2)
         axis[0].axhline(TARGET, color="grey", linewidth=0.8)
         axis[0].set_title(material)
         axis[1].set_xlabel("mouth")

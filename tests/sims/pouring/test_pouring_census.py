@@ -44,9 +44,11 @@ def test_a_sphere_flows_is_received_and_counted_once(scene):
     assert len(census.landings) == 0
     assert place(simulation, census, (0.78, 0.1, 0.21), (0.3, 0, -0.5)) is SphereClass.BOUNCED
     assert np.allclose(census.landings, [[-0.02, 0.1]])
-    assert census.in_receiver == 1 and census.flowing == 0
+    assert census.in_receiver == 1
+    assert census.flowing == 0
     assert place(simulation, census, (0.8, 0.1, 0.05)) is SphereClass.RECEIVED
-    assert census.in_receiver == 1 and census.in_source == 99
+    assert census.in_receiver == 1
+    assert census.in_source == 99
     census.start_trial()
     assert len(census.landings) == 0
 
@@ -65,7 +67,8 @@ def test_spheres_in_a_source_above_the_receiver_are_not_poured(scene):
     simulation.positions[:, 0] += RECEIVER_X
     simulation.positions[:, 2] += 0.2
     census.update(simulation)
-    assert census.in_source == 100 and census.in_receiver == 0
+    assert census.in_source == 100
+    assert census.in_receiver == 0
 
 
 def test_spilled_spheres_stay_spilled(scene):

@@ -26,12 +26,12 @@ def test_it_is_registered_and_reports_the_usual_metrics():
     action |= {"skill": 1, "pour_position": np.array([0.43, 0.05], np.float32)}
     seen, reward, terminated, truncated, info = env.step(action)
     assert env.observation_space.contains(seen)
-    assert terminated and not truncated and info["success"]
+    assert terminated
+    assert not truncated
+    assert info["success"]
     assert info["fraction_in_receiver"] > 0.5
     assert info["spilled_particles"] == 100 * info["fraction_spilled"]
-    assert reward == pytest.approx(
-        reward_of(float(seen["poured"][0]) - 0.3, info["spilled_particles"] * 0.1), abs=1e-4
-    )
+    assert reward == pytest.approx(reward_of(float(seen["poured"][0]) - 0.3, info["spilled_particles"] * 0.1), abs=1e-4)
     env.close()
 
 

@@ -37,7 +37,8 @@ def test_an_episode_keeps_every_step():
         "shaken",
         "poured",
     ]
-    assert episode.end is End.TARGET and episode.stops == ["target"]
+    assert episode.end is End.TARGET
+    assert episode.stops == ["target"]
 
 
 def test_a_failure_ends_the_episode():
@@ -50,7 +51,8 @@ def test_a_failure_ends_the_episode():
 
     episode = run_episode(world, policy, 0)
     assert episode.end is End.FAILED
-    assert episode.steps[-1][0] == "failed" and episode.steps[-1][1]["poured"] == 0.0
+    assert episode.steps[-1][0] == "failed"
+    assert episode.steps[-1][1]["poured"] == 0.0
     assert episode.stops == []
 
 

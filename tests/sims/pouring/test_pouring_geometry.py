@@ -33,9 +33,7 @@ def test_inside_is_the_box_and_the_funnel():
 def test_the_only_way_out_is_the_mouth():
     source = Source(0.13)
     top = SOURCE_HEIGHT + source.lip
-    before = np.array(
-        [(0.0, 0.0, top - 0.01), (0.05, 0.05, top - 0.01), (0.1, 0, top - 0.01), (0.14, 0, 0.2)]
-    )
+    before = np.array([(0.0, 0.0, top - 0.01), (0.05, 0.05, top - 0.01), (0.1, 0, top - 0.01), (0.14, 0, 0.2)])
     after = before + [(0, 0, 0.02), (0.01, 0, 0.03), (0, 0, 0.02), (0.05, 0, 0)]
     assert source.through_mouth(before, after).tolist() == [True, True, False, False]
     assert source.through_mouth(after, before).tolist() == [True, True, False, False]
@@ -68,10 +66,10 @@ def test_the_source_rises_over_rim_heap_and_floor_only_where_it_must():
 
 @pytest.mark.parametrize("mouth", [0.1, 0.26])
 def test_a_wrong_mouth_is_named(mouth):
-    with pytest.raises(ValueError, match="give a number from 0.11 to 0.25"):
+    with pytest.raises(ValueError, match=r"give a number from 0.11 to 0.25"):
         Source(mouth)
 
 
 def test_a_wrong_receiver_is_named():
-    with pytest.raises(ValueError, match="give length, width, height from 0.1 to 1"):
+    with pytest.raises(ValueError, match=r"give length, width, height from 0.1 to 1"):
         Receiver((0.3, 0.4, 0.0))

@@ -44,9 +44,7 @@ def test_two_spheres_part_with_the_asked_share_of_their_speed(bounce):
             for phase in np.linspace(0.0, 1.0, 8, endpoint=False):
                 mujoco.mj_resetData(simulation.model, simulation.data)
                 # All but two wait far away, each on its own.
-                simulation.positions[:] = np.stack(
-                    [np.arange(100) * 0.2, np.full(100, 5.0), np.ones(100)], axis=1
-                )
+                simulation.positions[:] = np.stack([np.arange(100) * 0.2, np.full(100, 5.0), np.ones(100)], axis=1)
                 simulation.positions[:2] = [[0, -5, 1], [0.06 + phase * speed / 80, -5, 1]]
                 simulation.velocities[1, 0] = -speed
                 mujoco.mj_step(simulation.model, simulation.data, 60)

@@ -67,7 +67,8 @@ def test_flow_at_the_end_of_the_tilt_is_waited_out():
         tip.next(False, False)
     for _ in range(300):
         tip.next(True, False)
-    assert not tip.ended and tip.phase is TipPhase.HOLD
+    assert not tip.ended
+    assert tip.phase is TipPhase.HOLD
 
 
 def test_shaking_turns_over_then_strokes_in_pairs():
@@ -76,10 +77,8 @@ def test_shaking_turns_over_then_strokes_in_pairs():
         command = shake.next(False, False)
         assert np.allclose(command[:2], START[:2])
     assert command[2] > END_TILT
-    cycle = []
     pause = round(PAUSE / CONTROL_STEP)
-    for _ in range(4 * 3 + pause):  # 0.06 at 0.8 takes 3 control steps each way
-        cycle.append(shake.next(True, False))
+    cycle = [shake.next(True, False) for _ in range(4 * 3 + pause)]  # 0.06 at 0.8 takes 3 control steps each way
     depth = START[1] - np.array(cycle)[:, 1]
     assert np.allclose(depth, [0.02, 0.04, 0.06, 0.04, 0.02, 0.0] * 2 + [0.0] * pause)
     assert np.allclose(np.array(cycle)[:, 0], START[0])

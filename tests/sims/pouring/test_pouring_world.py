@@ -71,9 +71,7 @@ def test_every_edge_observes_its_labels(shaken):
     _, start, seen = shaken
     assert sizes(start) == START_SIZES
     assert {node: sizes(observed) for node, observed in seen.items()} == EDGE_SIZES
-    scalars = [
-        value for observed in (start, *seen.values()) for value in observed.values() if np.size(value) == 1
-    ]
+    scalars = [value for observed in (start, *seen.values()) for value in observed.values() if np.size(value) == 1]
     assert all(isinstance(value, float) for value in scalars)
 
 
@@ -101,7 +99,7 @@ def test_an_episode_ends_when_the_target_is_reached(shaken):
     world, _, _ = shaken
     assert world.execute("poured", {}) == {}
     assert world.end is End.TARGET
-    with pytest.raises(ValueError, match="the episode is over .target reached.; call reset"):
+    with pytest.raises(ValueError, match=r"the episode is over .target reached.; call reset"):
         world.execute("poured", {})
 
 
@@ -174,7 +172,8 @@ def test_a_source_that_would_hit_the_receiver_is_raised_and_reported():
     advance(world, "ready", actions=ACTION | {"pour_position": (-0.3, 0.32)})
     world.execute("ready", ACTION | {"shake_stroke": (0.1, -1.57)}, {"skill": "shake"})
     lifts = [clamp.used[0] for clamp in world.clamps if clamp.label == "lift"]
-    assert lifts and 0.0 < max(lifts) < 0.2
+    assert lifts
+    assert 0.0 < max(lifts) < 0.2
 
 
 def test_a_push_moves_the_receiver():
@@ -199,7 +198,8 @@ def test_wrong_calls_are_named_and_change_nothing(node, actions, selections, wor
     before = digest(world)
     with pytest.raises(ValueError, match=words):
         world.execute(node, actions, selections)
-    assert world.node == "start" and digest(world) == before
+    assert world.node == "start"
+    assert digest(world) == before
 
 
 def test_an_unknown_skill_is_named():
