@@ -14,7 +14,7 @@ from random_tasks import random_problem, to_symgraph
 from small_tasks import assert_close, fork, over_box
 
 import symgraph as sg
-from symgraph.compile import library
+from symgraph.compile import toolchain
 from symgraph.compile.compiled import CompiledKernel
 from symgraph.compile.interpreted import InterpretedKernel
 from symgraph.compile.kernel import AdadeltaSteps
@@ -37,7 +37,7 @@ def kernels(objective, state=None, low=None, high=None):
     bounds = objective.bounds
     low, high = bounds[0] if low is None else low, bounds[1] if high is None else high
     function = situation.build.function
-    made = InterpretedKernel(function), CompiledKernel(function, library.find_compiler())
+    made = InterpretedKernel(function), CompiledKernel(function, toolchain.find_compiler())
     return [kernel.bind(situation.shared, np.array(low), np.array(high)) for kernel in made]
 
 
@@ -200,21 +200,21 @@ def test_threads_do_not_disturb_each_other(compiled):
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
     """A cache folder for this test alone, and a fresh look for compilers."""
-    monkeypatch.setattr(library.platformdirs, "user_cache_dir", lambda name: str(tmp_path / name))
-    library.find_compiler.cache_clear()
+    monkeypatch.setattr(toolchain.platformdirs, "user_cache_dir", lambda name: str(tmp_path / name))
+    toolchain.find_compiler.cache_clear()
     yield tmp_path / "symgraph" / "kernels"
-    library.find_compiler.cache_clear()
+    toolchain.find_compiler.cache_clear()
 
 
 @pytest.fixture
 def compilations(monkeypatch):
-    made, original = [], library._compile
+    made, original = [], toolchain._compile
 
     def counted(*arguments):
         made.append(arguments)
         return original(*arguments)
 
-    monkeypatch.setattr(library, "_compile", counted)
+    monkeypatch.setattr(toolchain, "_compile", counted)
     return made
 
 
@@ -239,7 +239,7 @@ def test_another_task_is_compiled_anew(cache, compilations):
 
 def test_another_compiler_or_version_is_compiled_anew(cache, compilations, monkeypatch):
     plan()
-    monkeypatch.setattr(library, "_identity", lambda compiler: (compiler, "another version", "", ""))
+    monkeypatch.setattr(toolchain, "_identity", lambda compiler: (compiler, "another version", "", ""))
     plan()
     assert len(compilations) == 2
 
@@ -318,7 +318,7 @@ def test_the_cache_is_private(cache):
 
 
 def test_without_a_compiler_one_warning_and_the_interpreter(cache, monkeypatch):
-    monkeypatch.setattr(library.shutil, "which", lambda name: None)
+    monkeypatch.setattr(toolchain.shutil, "which", lambda name: None)
     with pytest.warns(UserWarning, match=r"no C compiler found .*interpreter.*install") as caught:
         first = plan()
     assert len(caught) == 1
@@ -345,7 +345,7 @@ def test_a_broken_compiler_gives_a_warning_and_the_interpreter(cache, tmp_path, 
     compiler.write_text(BROKEN[how])
     compiler.chmod(0o755)
     monkeypatch.setenv("CC", str(compiler))
-    library._identity.cache_clear()
+    toolchain._identity.cache_clear()
     with pytest.warns(UserWarning, match="interpreter") as caught:
         made = plan()
     assert made.actions["u"] == pytest.approx(0.5)

@@ -7,7 +7,6 @@ from small_tasks import assert_close, objective_of, over_box, refuses
 
 import symgraph as sg
 from symgraph import objective as objective_module
-from symgraph.compile import library
 
 SLOTS = {
     "speed": sg.State(unit="m/s"),

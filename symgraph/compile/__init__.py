@@ -9,7 +9,7 @@ import casadi as ca
 from symgraph.compile.compiled import CompiledKernel
 from symgraph.compile.interpreted import InterpretedKernel
 from symgraph.compile.kernel import Kernel
-from symgraph.compile.library import find_compiler
+from symgraph.compile.toolchain import find_compiler
 from symgraph.errors import CompileError
 
 

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from symgraph.compile.kernel import AdadeltaSteps, BoundKernel, Ended, Kernel, Outcome
-from symgraph.compile.library import load
+from symgraph.compile.toolchain import load
 from symgraph.slots import Array
 
 # The point-by-point call of CasADi's function, before search.c.
@@ -109,11 +109,11 @@ class CompiledKernel(Kernel):
         steps = [whole, *[number] * 4, ctypes.c_int, ctypes.c_int, ctypes.c_int]
         library.symgraph_ascend.argtypes = [*[pointer] * 5, *steps, *[pointer] * 4]
         library.symgraph_ascend.restype = whole
-        self.library: Any = library
+        self.code: Any = library
         self.work = int(library.symgraph_work())
 
     def __getstate__(self) -> dict[str, Any]:  # other processes load the library from the cache
-        return {name: value for name, value in self.__dict__.items() if name not in ("library", "work")}
+        return {name: value for name, value in self.__dict__.items() if name not in ("code", "work")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -148,7 +148,7 @@ class _BoundCompiled(BoundKernel):
     def evaluate(self, actions: Array, selections: Array) -> tuple[Array, Array]:
         actions, selections = contiguous(actions), contiguous(selections)
         values, gradients = np.empty(len(actions)), np.empty(actions.shape)
-        self._kernel.library.symgraph_evaluate(
+        self._kernel.code.symgraph_evaluate(
             len(actions),
             _address(actions),
             _address(selections),
@@ -160,13 +160,13 @@ class _BoundCompiled(BoundKernel):
         return values, gradients
 
     def climb(self, start: Array, selection: Array, iterations: int, tolerance: float) -> Ended:
-        function = self._kernel.library.symgraph_climb
+        function = self._kernel.code.symgraph_climb
         return self._search(function, start, selection, iterations, (iterations, tolerance))
 
     def ascend(self, start: Array, selection: Array, limit: int, steps: AdadeltaSteps) -> Ended:
         numbers = steps.decay, steps.epsilon, steps.tolerance, steps.scale
         settings = (limit, *numbers, steps.oscillation, steps.scaled, steps.keep_best)
-        return self._search(self._kernel.library.symgraph_ascend, start, selection, limit + 1, settings)
+        return self._search(self._kernel.code.symgraph_ascend, start, selection, limit + 1, settings)
 
     def _search(self, function: Any, start: Array, selection: Array, length: int, settings: tuple[Any, ...]) -> Ended:
         if self._history.size < length:
