@@ -254,7 +254,7 @@ class Gain:
 
 def test_a_changed_parameter_needs_neither_build_nor_compiler(builds, monkeypatch):
     compilations = []
-    monkeypatch.setattr(library, "_compile", _counted(library._compile, compilations))
+    monkeypatch.setattr(toolchain, "_compile", _counted(toolchain._compile, compilations))
     gain = Gain()
     g = sg.Graph({"u": sg.Action(low=-10, high=10), "y": sg.State()}, "n")
     g.edge("n", "m", gain)
