@@ -7,6 +7,7 @@ from small_tasks import assert_close, objective_of, over_box, refuses
 
 import symgraph as sg
 from symgraph import objective as objective_module
+from symgraph.compile import toolchain
 
 SLOTS = {
     "speed": sg.State(unit="m/s"),
