@@ -114,23 +114,27 @@ class Problem:
             choices[:, s] = np.asarray(allowed)[digit]
         return choices
 
-    def draw_points(self, rng: np.random.Generator, count: int, sampling: str) -> Array:
-        """Draw points (count, n).
+    def draw_points(self, rng: np.random.Generator, count: int, sampling: str, blocks: int = 1) -> Array:
+        """Draw points (blocks · count, n).
 
         Args:
             rng: source of randomness.
-            count: how many.
+            count: how many in a block.
             sampling: "uniform"; "gaussian", around the middle with a quarter of the range as standard deviation,
-                clipped; or "spread", a Latin hypercube (McKay, Beckman & Conover 1979).
+                clipped; or "spread", each block a Latin hypercube (McKay, Beckman & Conover 1979).
+            blocks: how many blocks, one after the other.
         """
+        span = self.high - self.low
+        shape = (blocks, count, self.n)
         if sampling == "gaussian":
-            points = (self.low + self.high) / 2 + (self.high - self.low) / 4 * rng.standard_normal((count, self.n))
-            return np.clip(points, self.low, self.high)
-        unit = rng.random((count, self.n))
-        if sampling == "spread":
-            ranks = rng.permuted(np.tile(np.arange(count)[:, None], (1, self.n)), axis=0)
-            unit = (ranks + unit) / count
-        return np.clip(self.low + (self.high - self.low) * unit, self.low, self.high)
+            points = (self.low + self.high) / 2 + span / 4 * rng.standard_normal(shape)
+        else:
+            unit = rng.random(shape)
+            if sampling == "spread":
+                ranks = np.broadcast_to(np.arange(count)[None, :, None], shape)
+                unit = (rng.permuted(ranks, axis=1) + unit) / count
+            points = self.low + span * unit
+        return np.clip(points, self.low, self.high).reshape(blocks * count, self.n)
 
     def started_from_guesses(self, rng: np.random.Generator) -> tuple[Array, Choices]:
         """Return the guesses as points (P, n) and choices (P, s).

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from symgraph.optimizers.problem import Choices, Problem, Run
 from symgraph.slots import Array
@@ -38,27 +39,37 @@ def promising_points(problem: Problem, rng: np.random.Generator, starts: int, sa
     groups = problem.draw_choices(rng, looked_at, evenly=True)
     each = max(1, starts // looked_at)
     count = max(each, min(each * samples, MOST_SAMPLES)) if problem.n else 1
-    points = np.concatenate([problem.draw_points(rng, count, "spread") for _ in groups])
+    points = problem.draw_points(rng, count, "spread", blocks=looked_at)
     choices = np.repeat(groups, count, axis=0)
     values = problem.values(points, choices)
-    unit = problem.unit(points)
-    kept = []
-    for k in range(looked_at):
-        block = np.arange(k * count, (k + 1) * count)
-        problem.remember_scale(groups[k], values[block])
-        kept += [block[i] for i in _peaks(unit[block], values[block], each)]
+    by_group = values.reshape(looked_at, count)
+    for group, sampled in zip(groups, by_group, strict=True):
+        problem.remember_scale(group, sampled)
+    peaks = _peaks(problem.unit(points).reshape(looked_at, count, problem.n), by_group, each)
+    kept = (peaks + count * np.arange(looked_at)[:, None]).ravel()
     if looked_at > starts:  # not every combination has a start: those with the best samples have
-        kept = [kept[i] for i in np.argsort(-values[kept], kind="stable")[:starts]]
+        kept = kept[np.argsort(-values[kept], kind="stable")[:starts]]
     return points[kept], choices[kept]
 
 
-def _peaks(unit: Array, values: Array, count: int) -> list[int]:
-    """Return the indices of the best sample and of those in the better half that lie farthest from any better one."""
-    order = np.argsort(-values, kind="stable")[: max(count, (len(values) + 1) // 2)]
-    if len(order) <= count:
-        return [int(i) for i in order]
-    squares = (unit[order] ** 2).sum(axis=1)
-    distances = squares[:, None] + squares[None] - 2.0 * unit[order] @ unit[order].T
-    better = np.tri(len(order), k=-1, dtype=bool)  # [i, j]: j is better than i
-    to_better = np.where(better, distances, np.inf).min(axis=1)
-    return [int(i) for i in order[np.argsort(-to_better, kind="stable")[:count]]]
+def _peaks(unit: Array, values: Array, count: int) -> npt.NDArray[np.int64]:
+    """Return in each group the best sample and those of the better half that lie farthest from any better one.
+
+    Args:
+        unit: (G, P, n) samples scaled to [0, 1].
+        values: (G, P) their values.
+        count: how many to return.
+
+    Returns:
+        (G, count) indices into P.
+    """
+    better_half = max(count, (values.shape[1] + 1) // 2)
+    order = np.argsort(-values, axis=1, kind="stable")[:, :better_half]
+    if better_half <= count:
+        return order
+    ordered = np.take_along_axis(unit, order[:, :, None], axis=1)
+    squares = (ordered**2).sum(axis=2)
+    distances = squares[:, :, None] + squares[:, None, :] - 2.0 * ordered @ ordered.transpose(0, 2, 1)
+    distances[:, ~np.tri(better_half, k=-1, dtype=bool)] = np.inf  # to better ones only, which stand before
+    farthest = np.argsort(-distances.min(axis=2), axis=1, kind="stable")[:, :count]
+    return np.take_along_axis(order, farthest, axis=1)
