@@ -171,6 +171,11 @@ class NodeOutcomes(Sequence[NodeOutcome]):
     def notes(self) -> list[str]:
         """Say what makes the numbers less than they seem: probabilities that do not sum to 1, paths that are cut."""
         found = []
+        kinds = {group.group.kind for node in self.tree.nodes for group in node.groups}
+        if "reward" not in kinds and not any(node.cut for node in self.tree.nodes):
+            found.append(
+                "no reward is paid anywhere in the tree, so every plan is worth 0; add graph.reward(node, model)"
+            )
         for node in self.tree.nodes:
             if not self.probabilities[node.index]:
                 continue

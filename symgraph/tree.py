@@ -16,7 +16,7 @@ from symgraph.graph import Branch, Graph, Group, edge_label
 from symgraph.slots import State
 
 MOST_SHOWN = 300  # nodes that a notebook draws unasked; more take long and nobody can read them
-MAX_NODES = 1_000_000  # beyond it memory runs out before the user learns why
+MAX_NODES = 300_000  # beyond it memory runs out before the user learns why
 
 
 @dataclass(frozen=True)
