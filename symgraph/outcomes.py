@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, overload
 
-import casadi as ca
 import numpy as np
 
 from symgraph.binding import REWARD, BoundModel
@@ -46,18 +45,18 @@ class ModelNumbers:
     """Evaluates models in numbers, each with the function that its expression is made of."""
 
     def __init__(self) -> None:
-        self._functions: dict[tuple[BoundModel, tuple[str, ...]], tuple[FlatFunction, ca.Function]] = {}
+        self._functions: dict[tuple[BoundModel, tuple[str, ...]], FlatFunction] = {}
 
     def __call__(self, model: BoundModel, here: Mapping[str, Moments]) -> dict[str, Moments]:
         """Return what a model writes; NaN where it fails."""
         uncertain = tuple(label for label in model.reads if here[label][1] is not None)
         if (model, uncertain) not in self._functions:
-            function = model.function_for(uncertain)
-            self._functions[model, uncertain] = FlatFunction(function), function
-        evaluate, _ = self._functions[model, uncertain]
+            self._functions[model, uncertain] = FlatFunction(model.function_for(uncertain))
         columns = [here[label][0] for label in model.reads]
         columns += [covariance for label in uncertain if (covariance := here[label][1]) is not None]
-        results = evaluate([*columns, *(parameter.value.ravel(order="F") for parameter in model.parameters)])
+        results = self._functions[model, uncertain](
+            [*columns, *(parameter.value.ravel(order="F") for parameter in model.parameters)]
+        )
         n = len(model.writes)
         return {
             label: (results[i], results[n + i] if results[n + i].size else None) for i, label in enumerate(model.writes)
@@ -114,7 +113,11 @@ class NodeOutcomes(Sequence[NodeOutcome]):
     def __len__(self) -> int:
         return len(self._dictionaries)
 
-    def __getitem__(self, index):  # type: ignore[no-untyped-def]  # as in Sequence: int → outcome, slice → list
+    @overload
+    def __getitem__(self, index: int) -> NodeOutcome: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[NodeOutcome]: ...
+    def __getitem__(self, index: int | slice) -> NodeOutcome | list[NodeOutcome]:
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         node = self.tree.nodes[range(len(self))[index]]

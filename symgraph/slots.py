@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -63,6 +64,11 @@ class Action:
             raise SlotError(
                 f"Action: low = {self.lower[i]:g} is above high = {self.upper[i]:g} (element {i}); swap them"
             )
+
+        if not all(
+            math.isfinite(high - low) for low, high in zip(self.lower.tolist(), self.upper.tolist(), strict=True)
+        ):
+            raise SlotError(f"Action: the range from low = {self.low} to high = {self.high} is not finite; narrow it")
 
     @property
     def lower(self) -> Array:

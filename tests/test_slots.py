@@ -218,3 +218,8 @@ def test_gaussian_keeps_no_hold_on_the_arrays_it_was_given():
     g = sg.Gaussian(mean, covariance)
     mean[0] = covariance[0, 0] = 5
     assert g == sg.Gaussian([0, 0], np.eye(2))
+
+
+def test_a_range_that_overflows_is_refused():
+    with pytest.raises(sg.SlotError, match=r"range from low .* is not finite; narrow it"):
+        sg.Action(low=-1e308, high=1e308)
