@@ -1,7 +1,7 @@
 # symgraph's commands; `make` alone lists them. Each sets up .venv when pyproject.toml has changed.
 
-# What the tests need of pyproject.toml's extras: when tests/ has tests of networks or of MuJoCo, write `all`.
-EXTRAS := dev,sims
+# What the tests need of pyproject.toml's extras.
+EXTRAS := all
 
 BIN := .venv/bin
 SETUP := .venv/.set-up

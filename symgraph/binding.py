@@ -49,6 +49,11 @@ class BoundModel:
         self._noise = dict(noise)
         self._built: dict[tuple[str, ...], ca.Function] = {}
 
+    @property
+    def lacking(self) -> str | None:
+        """What the model still needs before it can be planned with, e.g. "2 of 3 samples"."""
+        return getattr(self._function, "lacking", None)
+
     def __getstate__(self) -> dict[str, Any]:  # CasADi's expressions do not travel; they are built anew
         return {**self.__dict__, "_built": {}}
 
@@ -120,10 +125,13 @@ class BoundModel:
             g.covariance + ca.DM(self._noise[label]) if label in self._noise else g.covariance
             for label, g in gaussians.items()
         ]
+        moments = [*x.values(), *sigma.values()]
         function = ca.Function(
             _identifier(self.name),
-            [*x.values(), *sigma.values(), *(parameter.symbol for parameter in self.parameters)],
+            [*moments, *(parameter.symbol for parameter in self.parameters)],
             [ca.densify(g.mean) for g in gaussians.values()] + [_full(c) for c in covariances],
+            # Nobody asks for derivatives by weights, and the reverse sweep would compute them.
+            {"is_diff_in": [True] * len(moments) + [False] * len(self.parameters)},
         )
         if self.parameters:  # weights are matrices: scalar by scalar they would be millions of instructions
             return function

@@ -165,7 +165,10 @@ class _Writer:
         written, own = _apply(branch.branch.model, here)
         value, instructions = self._value(branch.child or 0, {**here, **written})
         name = f"branch_{len(self._functions)}"
-        function = ca.Function(name, symbols + self._shared_symbols, [ca.densify(value)], {"cse": True})
+        inputs = symbols + self._shared_symbols
+        # Nobody asks for derivatives by selections and weights, and the reverse sweep would compute them.
+        follows = [True] * (len(symbols) + 1) + [False] * (len(self._shared_symbols) - 1)
+        function = ca.Function(name, inputs, [ca.densify(value)], {"cse": True, "is_diff_in": follows})
         if own + instructions <= FLATTEN_LIMIT:
             function = function.expand()
         self._functions[key] = function

@@ -20,7 +20,9 @@ class Propagator(Protocol):
     `reads` and `writes` hold labels; `propagate` maps {label: Gaussian of MX} to {label: Gaussian of MX}, means as
     (n, 1) columns and covariances as (n, n) matrices. A reward model writes one scalar under any name, a probability
     model one scalar per branch. Weights that change without a rebuild are listed as `parameters`, a sequence of
-    `Parameter`, and enter `propagate` by their symbols.
+    `Parameter`, and enter `propagate` by their symbols. Three more attributes are used where there are any: `name`, in
+    messages; `with_propagation(rule)`, for `Model(…, propagation=rule)`; and `lacking`, a text that says what it
+    still needs before it can be planned with, such as "2 of 3 samples", or None.
     """
 
     reads: Iterable[str]
@@ -82,8 +84,9 @@ class Model:
             {label: column} (a reward: one scalar; a probability: {branch: scalar}), or a `Propagator`.
             Parameters with a default value are constants of the function, not slots.
         rename: {name in the function: label of the graph}, for what it reads and what it writes.
-        propagation: how Gaussians pass a plain function: "mean", "linear" (default of an edge and a probability)
-            or "second-order" (default of a reward).
+        propagation: how Gaussians pass: "mean", "linear" (default of an edge and a probability), "second-order"
+            (default of a reward), "unscented" or "quadrature" for a plain function; the rules of
+            `symgraph.learned.StochasticNetwork` for a network.
         noise: {label: covariance} of independent process noise that is added to what it writes [unit²].
 
     Raises:
@@ -110,15 +113,22 @@ class Model:
             raise GraphError(f"model {self.name!r} is wrapped in Model twice; give all options to one Model")
         if not is_propagator(function) and not callable(function):
             raise GraphError(f"{function!r} is not a model; give a function of slots, a Model or a network")
-        if propagation is not None and (not isinstance(propagation, str) or propagation not in RULES):
+        if propagation is not None and is_propagator(function):
+            self.function = self._with_propagation(function, propagation)
+        elif propagation is not None and (not isinstance(propagation, str) or propagation not in RULES):
             raise GraphError(
                 f"model {self.name!r}: propagation = {propagation!r} is not a rule"
                 f"{did_you_mean(propagation, RULES)} Rules: {names(RULES)}"
             )
-        if propagation is not None and is_propagator(function):
-            raise GraphError(
-                f"model {self.name!r} propagates Gaussians by itself; leave out propagation={propagation!r}"
-            )
+
+    def _with_propagation(self, propagator: Any, rule: str) -> Propagator:
+        """Return the propagator under another rule, if it has several."""
+        if not hasattr(propagator, "with_propagation"):
+            raise GraphError(f"model {self.name!r} propagates Gaussians by itself; leave out propagation={rule!r}")
+        try:
+            return propagator.with_propagation(rule)  # type: ignore[no-any-return]  # any object may offer it
+        except ValueError as error:
+            raise GraphError(f"model {self.name!r}: {error}") from None
 
     def __repr__(self) -> str:
         return f"Model({self.name})"
@@ -132,5 +142,7 @@ def is_propagator(function: Any) -> bool:
 def _name(function: Any) -> str:
     if isinstance(function, Model):
         return function.name
+    if is_propagator(function) and isinstance(getattr(function, "name", None), str):
+        return str(function.name)
     target = getattr(function, "func", function)  # functools.partial
     return str(getattr(target, "__name__", type(target).__name__))

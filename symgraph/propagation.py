@@ -11,9 +11,15 @@ from typing import Any
 
 import casadi as ca
 
+from symgraph import cubature
+from symgraph.errors import GraphError
+
 Moments = tuple[Any, Any]  # mean (n, 1), covariance (n, n); one without non-zeros is exact
 
 Rule = Callable[[Any, Mapping[str, Any], Mapping[str, Any]], Moments]
+
+# Gauss–Hermite points for each direction, by the number of directions: a tensor over more grows out of hand.
+QUADRATURE_ORDERS = {1: 9, 2: 5, 3: 5}
 
 
 def mean(y: Any, x: Mapping[str, Any], covariance: Mapping[str, Any]) -> Moments:
@@ -39,4 +45,59 @@ def second_order(y: Any, x: Mapping[str, Any], covariance: Mapping[str, Any]) ->
     return y + ca.vertcat(*curvature), linear(y, x, covariance)[1]
 
 
-RULES: dict[str, Rule] = {"mean": mean, "linear": linear, "second-order": second_order}
+def unscented(y: Any, x: Mapping[str, Any], covariance: Mapping[str, Any]) -> Moments:
+    """Average over 2d + 1 points on the axes of Σ: exact for polynomials of degree 3 (Julier & Uhlmann 2004)."""
+    return _over_points(y, x, covariance, cubature.unscented(_directions(covariance)) if covariance else None)
+
+
+def quadrature(y: Any, x: Mapping[str, Any], covariance: Mapping[str, Any]) -> Moments:
+    """Average over a Gauss–Hermite grid on the axes of Σ: good for kinks; jumps it merely smooths.
+
+    9 points in one uncertain direction, 5 in each of two or three.
+
+    Raises:
+        GraphError: more than three uncertain directions.
+    """
+    directions = _directions(covariance)
+    if directions > max(QUADRATURE_ORDERS):
+        sizes = ", ".join(f"{label!r} {sigma.shape[0]}" for label, sigma in covariance.items())
+        raise GraphError(
+            f"propagation 'quadrature' over {directions} uncertain directions ({sizes}); it serves up to "
+            f"{max(QUADRATURE_ORDERS)}: use 'unscented', or split the model so that each part reads fewer of them"
+        )
+    rule = cubature.gauss_hermite(directions, QUADRATURE_ORDERS[directions]) if directions else None
+    return _over_points(y, x, covariance, rule)
+
+
+def _directions(covariance: Mapping[str, Any]) -> int:
+    return sum(sigma.shape[0] for sigma in covariance.values())
+
+
+def _over_points(y: Any, x: Mapping[str, Any], covariance: Mapping[str, Any], rule: cubature.Rule | None) -> Moments:
+    """Return E[y] = Σ w f(μ + Lz) and cov[y] = Σ w (f - E[y])(f - E[y])ᵀ over the rule's points z."""
+    if rule is None:
+        return mean(y, x, covariance)
+    function = ca.Function("f", list(x.values()), [y], {"allow_free": True})
+    roots = {label: cubature.square_root(sigma) for label, sigma in covariance.items()}
+    values = []
+    for z in rule.points.T:
+        moved, at = [], 0
+        for label, column in x.items():
+            n = column.numel() if label in roots else 0
+            moved.append(column + ca.mtimes(roots[label], ca.DM(z[at : at + n])) if n else column)
+            at += n
+        values.append(function.call(moved, True, False)[0])
+    columns = ca.horzcat(*values)
+    weights = ca.DM(rule.weights)
+    average = ca.mtimes(columns, weights)
+    deviations = columns - ca.repmat(average, 1, columns.shape[1])
+    return average, ca.mtimes(deviations * ca.repmat(weights.T, y.numel(), 1), deviations.T)
+
+
+RULES: dict[str, Rule] = {
+    "mean": mean,
+    "linear": linear,
+    "second-order": second_order,
+    "unscented": unscented,
+    "quadrature": quadrature,
+}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import re
 from collections.abc import Sequence
 from importlib import resources
 from typing import Any, get_args
@@ -12,6 +13,7 @@ import numpy as np
 
 from symgraph.compile.kernel import AdadeltaSteps, BoundKernel, Ended, Kernel, Outcome
 from symgraph.compile.toolchain import load
+from symgraph.errors import CompileError
 from symgraph.slots import Array
 
 # The point-by-point call of CasADi's function, before search.c.
@@ -92,7 +94,7 @@ class CompiledKernel(Kernel):
             "work": function.sz_w(),
         }
         search = (resources.files("symgraph.compile") / "search.c").read_text()
-        self._source = generator.dump() + _HEAD.format(**sizes) + search + _TAIL.format(**sizes)
+        self._source = _with_fast_products(generator.dump()) + _HEAD.format(**sizes) + search + _TAIL.format(**sizes)
         self._compiler = compiler
         self.n_actions, self.n_selections = function.numel_in(0), function.numel_in(1)
         self._load()
@@ -182,6 +184,21 @@ class _BoundCompiled(BoundKernel):
         spent = function(*self._before, *settings, *self._after)
         outcome = _OUTCOMES[self._outcome.value]
         return Ended(self._point.copy(), self._value.value, outcome, self._history[:spent].copy())
+
+
+def _with_fast_products(source: str) -> str:
+    """Put the products of matrices.c in place of CasADi's, where there are any."""
+    call = "casadi_mtimes_dense("
+    if call not in source:
+        return source
+    products = (resources.files("symgraph.compile") / "matrices.c").read_text()
+    theirs = re.compile(r"void casadi_mtimes_dense\([^)]*\) \{\n.*?\n\}\n", re.DOTALL)
+    replaced, times = theirs.subn(lambda _: products, source)
+    if times != 1:
+        raise CompileError(
+            f"CasADi {ca.CasadiMeta.version()} writes {call}…) in another form than is known; please report it"
+        )
+    return replaced
 
 
 def contiguous(column: Array) -> Array:

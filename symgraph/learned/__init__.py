@@ -1,0 +1,5 @@
+"""Learned models: networks that predict how sure they are, fitted to samples and planned with as they are."""
+
+from symgraph.learned.network import FitReport, StochasticNetwork
+
+__all__ = ["FitReport", "StochasticNetwork"]

@@ -1,0 +1,112 @@
+"""Learner: what a network remembers from one fit to the next, and how it goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from symgraph.learned.perceptron import Scaling, rescaled
+from symgraph.learned.training import (
+    Copies,
+    Folds,
+    Loss,
+    Training,
+    active_folds,
+    default_steps,
+    initial_copies,
+    train,
+)
+from symgraph.progress import Progress
+from symgraph.slots import Array
+
+GROWTH = 1.5  # times the samples of the last fit from scratch at which one begins anew
+WARM_SHARE = 0.3  # of the steps from scratch that a warm start takes
+
+
+@dataclass
+class Memory:
+    """Where the last training ended.
+
+    Attributes:
+        copies: all of them, also those that leave samples out.
+        x, y: the scaling of inputs and targets then.
+    """
+
+    copies: Copies
+    x: Scaling
+    y: Scaling | None
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How one fit goes: the same for all networks of a model."""
+
+    folds: npt.NDArray[np.int64]
+    active: int
+    warm: bool
+    steps: int
+
+
+class Learner:
+    """Keeps folds and decides, fit by fit, whether to go on from the weights there are.
+
+    A warm start is quick, but networks that began on few samples generalise worse than fresh ones (Ash & Adams, On
+    warm-starting neural network training, NeurIPS 2020). So a fit begins anew whenever the samples have grown by half.
+    """
+
+    def __init__(self) -> None:
+        self.folds = Folds()
+        self.begun_with = 0  # samples at the last fit from scratch
+
+    def schedule(self, *columns: Array) -> Schedule:
+        """Plan a fit to samples (N, …)."""
+        n = len(columns[0])
+        warm = 0 < self.begun_with <= n < GROWTH * self.begun_with
+        if not warm:
+            self.begun_with = n
+            self.folds = Folds()
+        steps = default_steps(n)
+        return Schedule(
+            self.folds.assign(*columns), active_folds(n), warm, round(WARM_SHARE * steps) if warm else steps
+        )
+
+    def fit(
+        self,
+        memory: Memory | None,
+        sizes: Sequence[int],
+        x: Array,
+        y: Array,
+        scaling: tuple[Scaling, Scaling | None],
+        loss: Loss,
+        schedule: Schedule,
+        rng: np.random.Generator,
+        progress: Progress,
+        last_bias: Array | None = None,
+    ) -> tuple[Memory, Training]:
+        """Train one network.
+
+        Args:
+            memory: from the last fit of this network.
+            sizes: of its layers.
+            x: (N, n), not scaled.
+            y: (N, m), not scaled; as the loss takes it where its scaling is None.
+            scaling: of x and y.
+            loss: see `train`.
+            schedule: of this fit.
+            rng: source of randomness.
+            progress: to report to.
+            last_bias: (m,) where a fit from scratch begins; 0 if left out.
+        """
+        count = 1 + schedule.active
+        if schedule.warm and memory is not None and memory.copies.count >= count:
+            copies = rescaled(memory.copies.first(count), (memory.x, memory.y), scaling)
+        else:
+            copies = initial_copies(sizes, scaling[0](x), count, rng)
+            if last_bias is not None:
+                copies.biases[-1][:] = last_bias
+        targets = y if scaling[1] is None else scaling[1](y)
+        training = train(copies, scaling[0](x), targets, schedule.folds, loss, schedule.steps, rng, progress)
+        return Memory(training.copies, *scaling), training

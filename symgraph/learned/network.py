@@ -1,0 +1,302 @@
+"""StochasticNetwork: a model learned from samples, with its own uncertainty."""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+
+from symgraph.compile.interpreted import FlatFunction
+from symgraph.cubature import gauss_hermite, square_root
+from symgraph.errors import InputError
+from symgraph.learned import losses
+from symgraph.learned.gaussians import RULES, Mixture, pass_error, pass_through
+from symgraph.learned.inputs import (
+    checked_count,
+    checked_hidden,
+    checked_option,
+    checked_pair,
+    checked_rows,
+    checked_sizes,
+    mean_and_root,
+)
+from symgraph.learned.learner import Learner, Memory
+from symgraph.learned.perceptron import Perceptron, Scaling
+from symgraph.model import Parameter
+from symgraph.progress import Progress
+from symgraph.slots import Array, Gaussian
+
+ErrorModel = Literal["likelihood", "paper", "none"]
+ERROR_MODELS: tuple[ErrorModel, ...] = ("likelihood", "paper", "none")
+HERMITE = 5  # points for the expectation over one output of the error network
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """What a fit did.
+
+    Attributes:
+        samples: how many there were.
+        warm: whether it went on from the weights of the fit before.
+        steps: of the mean network and of the error network.
+        rmse: (m,) root mean square error on samples that were left out [units of the outputs].
+        seconds: wall time [s].
+    """
+
+    samples: int
+    warm: bool
+    steps: tuple[int, ...]
+    rmse: Array
+    seconds: float
+
+    def __str__(self) -> str:
+        errors = ", ".join(f"{error:.3g}" for error in self.rmse)
+        how = "warm" if self.warm else "from scratch"
+        steps = " + ".join(map(str, self.steps))
+        return f"{self.samples} samples, {how}, {steps} steps in {self.seconds:.2f} s; held-out RMSE {errors}"
+
+
+@dataclass
+class Experience:
+    """What a network keeps between fits; shared by its views under other propagation rules."""
+
+    samples: int = 0
+    mean_learner: Learner = field(default_factory=Learner)
+    error_learner: Learner = field(default_factory=Learner)
+    mean: Memory | None = None
+    error: Memory | None = None
+
+
+class StochasticNetwork:
+    """A network of rectified linear units that predicts a mean and its own error, and propagates Gaussians.
+
+    y ~ N(f(x), diag(σ²(x))) for an exact x; for x ~ N(μ, Σ) mean and covariance of f are propagated through the layers
+    and E[σ²(x)] is added.
+
+    Args:
+        reads: {label: number of elements} of the inputs, in the order of the columns of x.
+        writes: {label: number of elements} of the outputs, likewise.
+        hidden: units in each hidden layer, of the mean network and of the error network alike.
+        propagation: how Gaussians pass, see the guide: "auto" (default), "split", "low-rank", "full", "full-exact",
+            "quadrature", "diagonal", "paper", "mean".
+        error: "likelihood" (default): σ maximises the likelihood of errors on samples that were left out; "paper":
+            the paper's asymmetric loss on errors of the training samples; "none": σ = 0.
+        samples_needed: with fewer, plans that need the network explore.
+        name: shown in messages and pictures.
+
+    Raises:
+        InputError: labels, sizes or options that make no network.
+
+    Source: Yamaguchi & Atkeson, Humanoids 2016, section V; ICRA 2016.
+    """
+
+    def __init__(
+        self,
+        reads: Mapping[str, int],
+        writes: Mapping[str, int],
+        hidden: Sequence[int] = (200, 200, 200),
+        *,
+        propagation: str = "auto",
+        error: ErrorModel = "likelihood",
+        samples_needed: int = 3,
+        name: str = "network",
+    ) -> None:
+        self.name = str(name)
+        self.reads = checked_sizes(reads, f"{self.name}: reads")
+        self.writes = checked_sizes(writes, f"{self.name}: writes")
+        self.hidden = checked_hidden(hidden, f"{self.name}: hidden")
+        self.propagation = checked_option(propagation, RULES, f"{self.name}: propagation")
+        self.error = checked_option(error, ERROR_MODELS, f"{self.name}: error")
+        self.samples_needed = checked_count(samples_needed, f"{self.name}: samples_needed")
+        sizes = (sum(self.reads.values()), *self.hidden, sum(self.writes.values()))
+        self._mean = Perceptron(sizes, f"{self.name}_mean")
+        self._error = Perceptron(sizes, f"{self.name}_error")
+        self._error_scale = Parameter(np.ones(sizes[-1]), f"{self.name}_error_scale")  # [units of the outputs]
+        self._experience = Experience()
+        self._built: dict[str, FlatFunction] = {}  # (mean, covariance) → (mean, covariance), by rule
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The weights, which enter an objective as its parameters: a fit changes them, and nothing is rebuilt."""
+        if self.error == "none":
+            return self._mean.parameters
+        return (*self._mean.parameters, *self._error.parameters, self._error_scale)
+
+    @property
+    def samples(self) -> int:
+        """How many samples the last fit had."""
+        return self._experience.samples
+
+    @property
+    def lacking(self) -> str | None:
+        """What is missing before it can be used, e.g. "2 of 3 samples"; None when nothing is."""
+        return None if self.samples >= self.samples_needed else f"{self.samples} of {self.samples_needed} samples"
+
+    def with_propagation(self, rule: str) -> StochasticNetwork:
+        """Return a view under another rule: the same weights, now and after further fits."""
+        view = copy.copy(self)
+        view.propagation = checked_option(rule, RULES, f"{self.name}: propagation")
+        return view
+
+    def propagate(self, inputs: Mapping[str, Gaussian]) -> dict[str, Gaussian]:
+        """Return {label: Gaussian} of what it writes, as expressions of its parameters; see `Propagator`."""
+        y, covariance = self._moments(*mean_and_root([inputs[label] for label in self.reads]))
+        written, at = {}, 0
+        for label, size in self.writes.items():
+            rows = slice(at, at + size)
+            written[label] = Gaussian(y[rows], covariance[rows, rows])
+            at += size
+        return written
+
+    def predict(self, mean: Any, covariance: Any = None) -> tuple[Array, Array]:
+        """Return mean and covariance of the outputs.
+
+        Args:
+            mean: (n,) or (N, n) inputs, in the order of `reads`.
+            covariance: (n, n), or (N, n, n), of the inputs; left out: exact.
+
+        Returns:
+            (m,) and (m, m), or (N, m) and (N, m, m), in the order of `writes`.
+
+        Raises:
+            InputError: arrays of other shapes.
+        """
+        n, m = self._mean.sizes[0], self._mean.sizes[-1]
+        single = np.ndim(mean) == 1
+        x = checked_rows([mean] if single else mean, n, f"{self.name}: mean")
+        if covariance is None:
+            y, spread = self._mean(x), self._variance(x)[:, :, None] * np.eye(m)
+        else:
+            sigma = np.asarray(covariance, dtype=float)
+            if sigma.shape not in ((n, n), (len(x), n, n)):
+                expected = f"({n}, {n})" + ("" if single else f" or ({len(x)}, {n}, {n})")
+                raise InputError(f"{self.name}: covariance has shape {sigma.shape}; give {expected}")
+            shared = [p.value.ravel(order="F") for p in self.parameters]
+            blocks = np.broadcast_to(sigma, (len(x), n, n))
+            rows = [self._numbers([row, block.ravel(), *shared]) for row, block in zip(x, blocks, strict=True)]
+            y, spread = np.array([row[0] for row in rows]), np.array([row[1].reshape(m, m) for row in rows])
+        return (y[0], spread[0]) if single else (y, spread)
+
+    def fit(self, x: Any, y: Any, *, seed: int = 0, progress: bool = True) -> FitReport:
+        """Learn from samples; a further call goes on from the weights there are.
+
+        Args:
+            x: (N, n) inputs in the order of `reads` [their units].
+            y: (N, m) outputs in the order of `writes` [their units].
+            seed: of all that is random: the same samples, seed and fits before give the same weights.
+            progress: show a progress bar where it takes longer than two seconds.
+
+        Raises:
+            InputError: arrays of other shapes, or numbers that are not finite.
+            MissingExtraError: torch is not installed.
+        """
+        begin = time.perf_counter()
+        x = checked_rows(x, self._mean.sizes[0], f"{self.name}: x")
+        y = checked_rows(y, self._mean.sizes[-1], f"{self.name}: y")
+        checked_pair(x, y, self.name)
+        rng = np.random.default_rng(seed)
+        scaling = Scaling.of(x), Scaling.of(y)
+        kept = self._experience
+        with Progress(f"fitting {self.name}", progress) as bar:
+            schedule = kept.mean_learner.schedule(x, y)
+            kept.mean, trained = kept.mean_learner.fit(
+                kept.mean, self._mean.sizes, x, y, scaling, losses.squares, schedule, rng, bar
+            )
+            self._mean.set(kept.mean.copies, *scaling)
+            errors = scaling[1](y) - trained.outputs
+            held_out = ~np.isnan(errors).any(axis=1)
+            steps: tuple[int, ...] = (trained.steps,)
+            if self.error == "likelihood":
+                steps += (self._fit_error(x[held_out], errors[held_out], scaling, rng, bar),)
+            elif self.error == "paper":
+                steps += (self._fit_error(x, np.abs(scaling[1](y - self._mean(x))), scaling, rng, bar),)
+        kept.samples = len(x)
+        rmse = np.sqrt(np.mean(errors[held_out] ** 2, axis=0)) * scaling[1].sd
+        return FitReport(len(x), schedule.warm, steps, rmse, time.perf_counter() - begin)
+
+    def _fit_error(
+        self, x: Array, errors: Array, scaling: tuple[Scaling, Scaling], rng: np.random.Generator, bar: Progress
+    ) -> int:
+        """Learn σ from errors (N, m) [standard deviations of the targets], and return the steps that it took."""
+        kept = self._experience
+        likelihood = self.error == "likelihood"
+        # From the errors' size, the same everywhere, it can only get better.
+        size = np.sqrt(np.mean(errors**2, axis=0)) + losses.LEAST_DEVIATION
+        kept.error, trained = kept.error_learner.fit(
+            kept.error,
+            self._error.sizes,
+            x,
+            errors,
+            (scaling[0], None),
+            losses.gaussian if likelihood else losses.asymmetric,
+            kept.error_learner.schedule(x),
+            rng,
+            bar,
+            losses.inverse_softplus(size) if likelihood else size,
+        )
+        self._error.set(kept.error.copies, scaling[0], None)
+        self._error_scale.value = scaling[1].sd
+        return trained.steps
+
+    def _variance(self, x: Array) -> Array:
+        """Return σ² (N, m) at exact inputs (N, n)."""
+        if self.error == "none":
+            return np.zeros((len(x), self._mean.sizes[-1]))
+        output = self._error(x)
+        sd = output if self.error == "paper" else np.logaddexp(0.0, output) + losses.LEAST_DEVIATION
+        return (sd * self._error_scale.value[:, 0]) ** 2
+
+    def _moments(self, mean: ca.MX, root: ca.MX | None) -> tuple[ca.MX, ca.MX]:
+        """Return mean (m, 1) and covariance (m, m) of the outputs for an input N(mean, root rootᵀ)."""
+        passed = pass_through(self.propagation, self._mean.layers, mean, root)
+        if self.error == "none":
+            return passed.mean, passed.covariance
+        errors = pass_error(self.propagation, self._error.layers, mean, root)
+        scale = self._error_scale.symbol
+        variance = errors.mean**2 if self.error == "paper" else _expected_square(errors)
+        return passed.mean, passed.covariance + ca.diag(variance * scale**2)
+
+    @property
+    def _numbers(self) -> FlatFunction:
+        if self.propagation not in self._built:
+            n = self._mean.sizes[0]
+            mean, sigma = ca.MX.sym("mean", n), ca.MX.sym("sigma", n, n)
+            y, covariance = self._moments(mean, square_root(sigma))
+            symbols = [mean, sigma, *(p.symbol for p in self.parameters)]
+            function = ca.Function("predict", symbols, [ca.densify(y), ca.densify(covariance)])
+            self._built[self.propagation] = FlatFunction(function)
+        return self._built[self.propagation]
+
+    def __getstate__(self) -> dict[str, Any]:  # CasADi's functions are built anew, with the parameters' new symbols
+        return {**self.__dict__, "_built": {}}
+
+    def __repr__(self) -> str:
+        reads, writes = ", ".join(self.reads), ", ".join(self.writes)
+        return f"StochasticNetwork({self.name}: {reads} → {writes}, hidden {self.hidden}, {self.samples} samples)"
+
+
+def _expected_square(errors: Mixture) -> ca.MX:
+    """Return E[σ²] (m, 1) with σ = softplus(h) + least and h from the mixture, by Gauss–Hermite over each h."""
+    if errors.variances is None:
+        squares = _deviation(errors.means) ** 2
+    else:
+        rule = gauss_hermite(1, HERMITE)
+        spread = ca.sqrt(errors.variances + 1e-16)
+        squares = sum(
+            (
+                w * _deviation(errors.means + z * spread) ** 2
+                for z, w in zip(rule.points[0].tolist(), rule.weights.tolist(), strict=True)
+            ),
+            ca.MX(0.0),
+        )
+    return squares if len(errors.weights) == 1 else ca.mtimes(squares, ca.DM(errors.weights))
+
+
+def _deviation(output: ca.MX) -> ca.MX:
+    above = ca.fmax(output, 0.0)
+    return ca.log1p(ca.exp(output - 2 * above)) + above + losses.LEAST_DEVIATION

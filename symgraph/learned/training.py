@@ -1,0 +1,250 @@
+"""Training: several copies of a network side by side, one on all samples and others that each leave a fold out.
+
+The copies that leave samples out say how well the network predicts what it has not seen: they decide when to stop, and
+their errors are what an error model must learn, since errors on the training samples themselves are far too small.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from symgraph.errors import MissingExtraError
+from symgraph.progress import Progress
+from symgraph.slots import Array
+
+if TYPE_CHECKING:
+    import torch
+
+FOLDS = 5
+ENOUGH_HELD_OUT = 1000  # held-out samples beyond which further folds only cost time
+COLUMNS = 384  # samples in a step times copies: more of the ones leaves room for fewer of the others
+LEARNING_RATE = 6e-3
+EVERY = 10  # steps between two looks at the held-out samples
+AVERAGING = 0.9  # of the moving average of the weights, which is what is kept
+MOST_SCORED = 4000  # held-out samples looked at on the way
+
+Float32 = npt.NDArray[np.float32]
+# outputs (M, B, m) and targets (B, m) → losses (M, B)
+Loss = Callable[["torch.Tensor", "torch.Tensor"], "torch.Tensor"]
+
+
+@dataclass
+class Copies:
+    """The weights of M copies of a network, the one that is used first.
+
+    Attributes:
+        weights: for each layer (M, in, out).
+        biases: for each layer (M, 1, out).
+    """
+
+    weights: list[Float32]
+    biases: list[Float32]
+
+    @property
+    def count(self) -> int:
+        return len(self.weights[0])
+
+    def first(self, count: int) -> Copies:
+        """Return the first copies."""
+        return Copies([w[:count] for w in self.weights], [b[:count] for b in self.biases])
+
+
+@dataclass
+class Folds:
+    """Which fold a sample belongs to, for good: a copy must never have been trained on what it is to be judged by.
+
+    Samples are known by their content, so that the order in which they are given does not matter and equal samples
+    share a fold.
+    """
+
+    known: dict[bytes, int] = field(default_factory=dict)
+
+    def assign(self, *columns: Array) -> npt.NDArray[np.int64]:
+        """Return the fold (N,) of each sample, dealing new ones to the folds with the fewest samples."""
+        rows = np.ascontiguousarray(np.hstack(columns))
+        digests = [hashlib.blake2b(row.tobytes(), digest_size=8).digest() for row in rows]
+        sizes = np.bincount([self.known[d] for d in digests if d in self.known], minlength=FOLDS)
+        # In the order of their digests, which is as good as random.
+        for digest in sorted(set(digests).difference(self.known)):
+            self.known[digest] = int(sizes.argmin())
+            sizes[self.known[digest]] += 1
+        return np.array([self.known[d] for d in digests], dtype=np.int64)
+
+
+def active_folds(samples: int) -> int:
+    """Return how many folds are left out in turn: fewer where one holds enough samples to judge by."""
+    return min(FOLDS, math.ceil(FOLDS * ENOUGH_HELD_OUT / samples))
+
+
+def default_steps(samples: int) -> int:
+    """Return the steps from scratch: 250 for 200 samples, 890 for 2,000, 3,100 for 20,000."""
+    return max(150, round(250 * math.pow(samples / 200, 0.55)))
+
+
+def initial_copies(sizes: Sequence[int], x: Array, count: int, rng: np.random.Generator) -> Copies:
+    """Return equal copies of a random network that gives 0 everywhere.
+
+    The kinks of the first layer pass through samples, so that they lie where the data are (with biases of 0 they
+    would all meet in the middle); He's scale keeps the size of what passes; the last layer is 0, so that training
+    begins with the mean of the targets.
+    """
+    weights, biases = [], []
+    for layer, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):
+        w = rng.standard_normal((inputs, outputs)) * math.sqrt((1 if layer == 0 else 2) / inputs)
+        b = np.zeros((1, outputs))
+        if layer == len(sizes) - 2:
+            w[:] = 0.0
+        elif layer == 0:
+            b[0] = -np.sum(w.T * x[rng.integers(len(x), size=outputs)], axis=1)
+        weights.append(np.repeat(w[None].astype(np.float32), count, axis=0))
+        biases.append(np.repeat(b[None].astype(np.float32), count, axis=0))
+    return Copies(weights, biases)
+
+
+@dataclass(frozen=True)
+class Training:
+    """What came of a training.
+
+    Attributes:
+        copies: the weights where the held-out loss was least.
+        outputs: (N, m) of the copies that had not seen the sample, NaN where every copy had.
+        loss: the mean held-out loss there.
+        steps: how many were made.
+    """
+
+    copies: Copies
+    outputs: Array
+    loss: float
+    steps: int
+
+
+def train(
+    copies: Copies,
+    x: Array,
+    targets: Array,
+    folds: npt.NDArray[np.int64],
+    loss: Loss,
+    steps: int,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> Training:
+    """Minimise a loss by Adam with a falling rate, all copies in one step, and keep the best weights on the way.
+
+    Args:
+        copies: where to start; copy 1 + k leaves out fold k.
+        x: (N, n) whitened inputs.
+        targets: (N, m).
+        folds: (N,) fold of each sample.
+        loss: of each copy and sample.
+        steps: at most; fewer when the held-out loss no longer falls.
+        rng: draws the samples of each step.
+        progress: is told of the steps.
+
+    Source: Kingma & Ba, Adam, ICLR 2015.
+    """
+    torch = import_torch()
+    n, held_out_copies = len(x), copies.count - 1
+    inputs, wanted = (torch.from_numpy(np.asarray(a, dtype=np.float32)) for a in (x, targets))
+    learns = np.ones((copies.count, n), dtype=np.float32)
+    for k in range(held_out_copies):
+        learns[1 + k, folds == k] = 0.0
+    learning = torch.from_numpy(learns)
+    judged = np.flatnonzero(folds < held_out_copies)
+    if len(judged) > MOST_SCORED:
+        judged = np.sort(rng.choice(judged, MOST_SCORED, replace=False))
+    judges = torch.from_numpy(1 + folds[judged])
+    rows = torch.from_numpy(judged)
+
+    tensors = [torch.from_numpy(a.copy()) for pair in zip(copies.weights, copies.biases, strict=True) for a in pair]
+    average = [tensor.clone() for tensor in tensors]
+    best = [tensor.clone() for tensor in tensors]
+
+    def held_out_loss() -> float:
+        with torch.no_grad():
+            losses = loss(_forward(average, inputs[rows]), wanted[rows])
+        return float(losses[judges, torch.arange(len(rows))].mean())
+
+    batch = min(n, max(32, COLUMNS // copies.count))
+    order, at = rng.permutation(n), 0
+    with _one_thread():
+        least, least_step, made = held_out_loss(), 0, 0
+        for tensor in tensors:
+            tensor.requires_grad_(True)
+        optimizer = torch.optim.Adam(tensors, lr=LEARNING_RATE, betas=(0.9, 0.99), fused=True)
+        for step in range(steps):
+            if at + batch > n:
+                order, at = rng.permutation(n), 0
+            chosen = torch.from_numpy(order[at : at + batch])
+            at += batch
+            # Up within ten steps, then down along half a cosine.
+            rate = min(1.0, (step + 1) / 10) * 0.5 * (1 + math.cos(math.pi * step / steps))
+            optimizer.param_groups[0]["lr"] = LEARNING_RATE * rate
+            weight = learning[:, chosen]
+            losses = loss(_forward(tensors, inputs[chosen]), wanted[chosen])
+            optimizer.zero_grad()
+            ((losses * weight).sum(1) / weight.sum(1).clamp(min=1.0)).sum().backward()
+            optimizer.step()
+            torch._foreach_lerp_(average, [tensor.detach() for tensor in tensors], 1 - AVERAGING)
+            made = step + 1
+            if made % EVERY == 0 or made == steps:
+                progress.update(made, steps)
+                now = held_out_loss()
+                if now < least:
+                    least, least_step = now, made
+                    for kept, tensor in zip(best, average, strict=True):
+                        kept.copy_(tensor)
+                elif made - least_step > max(60, steps // 3):
+                    break
+        outputs = np.full((n, best[-1].shape[-1]), np.nan)
+        with torch.no_grad():
+            for k in range(held_out_copies):
+                left_out = np.flatnonzero(folds == k)
+                one = [tensor[1 + k : 2 + k] for tensor in best]
+                outputs[left_out] = _forward(one, inputs[torch.from_numpy(left_out)])[0].numpy()
+    arrays = [tensor.numpy() for tensor in best]
+    return Training(Copies(arrays[0::2], arrays[1::2]), outputs, least, made)
+
+
+def _forward(tensors: Sequence[torch.Tensor], x: torch.Tensor) -> torch.Tensor:
+    """Return the outputs (M, B, m) for inputs (B, n); weights and biases alternate."""
+    torch = import_torch()
+    hidden = x.expand(tensors[0].shape[0], -1, -1)
+    for i in range(0, len(tensors), 2):
+        hidden = torch.baddbmm(tensors[i + 1], hidden, tensors[i])
+        if i < len(tensors) - 2:
+            hidden = torch.relu(hidden)
+    return hidden
+
+
+def import_torch() -> Any:
+    """Return torch, which only fitting needs.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    try:
+        import torch
+    except ImportError as error:
+        raise MissingExtraError("torch", "learned", "fitting a network") from error
+    return torch
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Compute on one core: the matrices are small, and the same sums in the same order give the same weights."""
+    torch = import_torch()
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
