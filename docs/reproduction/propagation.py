@@ -18,6 +18,7 @@ ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT)]
 
 import symgraph as sg
+from symgraph.cubature import square_root, unscented
 from symgraph.learned import StochasticNetwork
 
 FOLDER = Path(__file__).with_suffix("")
@@ -33,7 +34,7 @@ COLUMNS = [
     "value_ms",  # one value in CasADi's interpreter
     "gradient_ms",  # one value with its gradient, compiled
 ]
-PLAIN_RULES = {"local linear": "linear", "unscented": "unscented"}  # of plain functions
+PLAIN_RULES = ["local linear", "unscented"]
 RULES = [*PLAIN_RULES, "paper", "diagonal", "low-rank", "full", "full-exact", "quadrature", "split", "auto"]
 SPREADS = [3, 10]  # standard deviation of every input [% of its range]
 DRAWS = 1_000_000  # antithetic pairs count as two
@@ -121,21 +122,39 @@ def _mean(network, x):
     return hidden.astype(float)
 
 
+class PlainRule:
+    """What the rules for plain functions would make of the network: for comparison."""
+
+    reads, writes = ("x",), ("y",)
+
+    def __init__(self, network, rule):
+        self.rule, self.parameters = rule, network.parameters
+
+    def propagate(self, inputs):
+        x = inputs["x"]
+        if self.rule == "local linear":
+            y = self._outputs(x.mean)
+            slope = ca.jacobian(y, x.mean)
+            return {"y": sg.Gaussian(y, ca.mtimes([slope, x.covariance, slope.T]))}
+        rule = unscented(x.mean.numel())
+        root, weights = square_root(x.covariance), ca.DM(rule.weights)
+        ys = self._outputs(ca.repmat(x.mean, 1, len(rule.weights)) + ca.mtimes(root, ca.DM(rule.points)))
+        mean = ca.mtimes(ys, weights)
+        apart = ys - ca.repmat(mean, 1, len(rule.weights))
+        return {"y": sg.Gaussian(mean, ca.mtimes(apart * ca.repmat(weights.T, mean.numel(), 1), apart.T))}
+
+    def _outputs(self, x):
+        symbols = [p.symbol for p in self.parameters]
+        for i in range(0, len(symbols), 2):
+            x = ca.mtimes(symbols[i], x) + ca.repmat(symbols[i + 1], 1, x.shape[1])
+            x = ca.fmax(x, 0.0) if i < len(symbols) - 2 else x
+        return x
+
+
 def model_of(name, rule):
-    """The network under a rule; local linear and unscented are rules of plain functions."""
+    """The network under a rule."""
     network = trained(name)[0]
-    if rule not in PLAIN_RULES:
-        return sg.Model(network, propagation=rule)
-    weights = [ca.DM(p.value) for p in network.parameters]
-
-    def y(x):
-        hidden = x
-        for i in range(0, len(weights), 2):
-            hidden = ca.mtimes(weights[i], hidden) + weights[i + 1]
-            hidden = ca.fmax(hidden, 0.0) if i < len(weights) - 2 else hidden
-        return {"y": hidden}
-
-    return sg.Model(y, propagation=PLAIN_RULES[rule])
+    return PlainRule(network, rule) if rule in PLAIN_RULES else sg.Model(network, propagation=rule)
 
 
 def measure(name, spread, rule):
