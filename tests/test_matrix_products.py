@@ -113,7 +113,8 @@ int main(void) {
   int rows, depth, columns, bad = 0;
   for (rows = 1; rows <= 35; ++rows)
     for (depth = 1; depth <= 20; ++depth)
-      for (columns = 1; columns <= 10; ++columns) bad |= wrong(rows, depth, columns, 0) | wrong(rows, depth, columns, 1);
+      for (columns = 1; columns <= 10; ++columns)
+        bad |= wrong(rows, depth, columns, 0) | wrong(rows, depth, columns, 1);
   return bad;
 }
 """
