@@ -1,5 +1,7 @@
 """Gaussians through networks: where each rule is exact, its limits, and how near it comes elsewhere."""
 
+import itertools
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ KEEPS_COVARIANCES = ["auto", "split", "low-rank", "full", "full-exact", "quadrat
 def network(rng, sizes, shift=0.0):
     """Weights of He's size, and biases; `shift` is added to those of hidden units."""
     layers = []
-    for i, (n, m) in enumerate(zip(sizes, sizes[1:], strict=False)):
+    for i, (n, m) in enumerate(itertools.pairwise(sizes)):
         last = i == len(sizes) - 2
         layers.append((rng.normal(size=(m, n)) * np.sqrt(2 / n), rng.normal(size=m) * 0.5 + (0 if last else shift)))
     return layers
@@ -166,7 +168,7 @@ DEGENERATE = {
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("at_kink", [False, True], ids=["away", "at a kink"])
 def test_degenerate_covariances_are_finite_and_limits(rule, at_kink):
-    """Near by: with 1e-9 of the identity added, which moves smooth moments by its size, and means at a kink by its root."""
+    """Near by: with 1e-9 of the identity added, which moves smooth moments by its size, means at a kink by its root."""
     rng = np.random.default_rng(5)
     layers = network(rng, (2, 8, 8, 2))
     m = away_from_kinks(layers, rng)
@@ -319,7 +321,7 @@ def test_auto_splits_along_few_directions(directions):
 @settings(max_examples=15)
 @given(seed=st.integers(0, 2**32 - 1), inputs=st.integers(1, 8), outputs=st.integers(1, 4))
 def test_covariances_are_symmetric_and_positive_semidefinite(seed, inputs, outputs):
-    """To rounding; "full-exact" to the 1e-7 of its integral, and the series of "full" promises it of variances alone."""
+    """To rounding; "full-exact" to the 1e-7 of its integral, the series of "full" promises it of variances alone."""
     rng = np.random.default_rng(seed)
     layers = network(rng, (inputs, 6, 5, outputs))
     m, s = rng.normal(size=inputs), random_covariance(rng, inputs)
@@ -340,7 +342,7 @@ def test_covariances_are_symmetric_and_positive_semidefinite(seed, inputs, outpu
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("inputs", [2, MOST_SPLIT + 1])
 def test_what_gives_an_average_for_less_is_near(rule, inputs):
-    """It is the rule's own mean where the rule neither splits nor keeps covariances; elsewhere within 0.3 deviations."""
+    """The rule's own mean where it neither splits nor keeps covariances; elsewhere within 0.3 deviations."""
     rng = np.random.default_rng(inputs)
     layers = network(rng, (inputs, 8, 1))
     m, s = rng.normal(size=inputs), random_covariance(rng, inputs, 0.2)

@@ -70,8 +70,8 @@ def test_fewer_folds_where_one_holds_enough(samples, expected):
     ("samples", "expected"), [(1, 150), (200, 250), (2_000, 890), (20_000, 3_100)], ids=lambda value: str(value)
 )
 def test_steps_from_scratch(samples, expected):
-    """As the docstring says, rounded to two digits."""
-    assert default_steps(samples) == pytest.approx(expected, rel=0.01)
+    """As the docstring says, in two digits."""
+    assert default_steps(samples) == pytest.approx(expected, rel=0.02)
 
 
 # Where copies begin
@@ -176,7 +176,7 @@ def trained(seed=0, n=100, steps=30, change=None, folds=None, count=1 + FOLDS, l
     x, y, assigned = task(np.random.default_rng(7), n)
     assigned = assigned if folds is None else folds(assigned)
     if change is not None:
-        y[assigned == change] += 5.0
+        y[assigned == change] += 0.1
     rng = np.random.default_rng(seed)
     copies = initial_copies((2, 12, 12, 1), x, count, rng)
     return train(copies, x, y, assigned, loss, steps, rng, QUIET), (x, y, assigned, copies)
@@ -199,11 +199,11 @@ def test_the_same_seed_gives_the_same_weights():
 def test_a_copy_never_learns_from_the_fold_it_leaves_out(k):
     """Other targets in fold k change every copy but 1 + k: its weights stay the same to the last bit.
 
-    With as many steps as lie between two looks at the held-out loss, so that all are compared at the same step.
+    With as many steps as lie between two looks at the held-out loss, both keep what the last one left.
     """
-    (before, _), (after, _) = trained(steps=training.EVERY), trained(steps=training.EVERY, change=k)
-    if before.loss < after.loss:  # the last step was kept in both
-        pass
+    (before, (*_, start)), (after, _) = trained(steps=training.EVERY), trained(steps=training.EVERY, change=k)
+    for kept in (before, after):
+        assert (kept.copies.weights[-1] != start.weights[-1]).any()
     for copy in range(1 + FOLDS):
         pairs = zip(arrays(before.copies, copy), arrays(after.copies, copy), strict=True)
         same = all((left == right).all() for left, right in pairs)

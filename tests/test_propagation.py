@@ -125,7 +125,7 @@ def linear_form(a, m, s):
 @settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_unscented_means_of_cubics_are_exact(seed):
-    """Σ c (a'x)^k spans the polynomials of degree k, and a'x is a Gaussian; with two independent slots, five directions."""
+    """Sums of (a'x)^k span the polynomials of degree k, and a'x is a Gaussian; two slots, five directions."""
     rng = np.random.default_rng(seed)
     sizes = {"x": 3, "z": 2}
     slots = {label: (rng.normal(size=n), random_covariance(rng, n)) for label, n in sizes.items()}
@@ -233,7 +233,7 @@ def test_functions_that_only_a_call_can_evaluate(rule):
 
 
 def chain(rule, later):
-    """y = a·b·x + a·c for x ~ N(1, 0.3), two actions, and one that is sure; then a reward of y by the rule."""
+    """y = (a₁x₁ + a₂, a₂x₂ + 0.3) of two actions, then a reward of y by the rule."""
     graph = sg.Graph({"x": sg.State(2), "y": sg.State(2), "a": sg.Action(2, low=-1, high=1)}, start="n")
     graph.edge("n", "end", lambda x, a: {"y": ca.vertcat(a[0] * x[0] + a[1], a[1] * x[1] + 0.3)})
     graph.reward("end", sg.Model(later, propagation=rule))
@@ -256,7 +256,7 @@ def test_gradients_against_central_differences(rule, a):
 @pytest.mark.parametrize("rule", ["unscented", "quadrature"])
 @pytest.mark.parametrize("zero", [[0.0, 0.0], [0.0, 0.6], [0.6, 0.0]], ids=str)
 def test_gradients_where_actions_drive_a_variance_to_zero(rule, zero):
-    """Finite, and the limit from where it is not zero, to 1e-3: where a standard deviation of 0.3 goes through zero, the
+    """Finite, and the limit from where it is not zero, to 1e-3: where a standard deviation goes through zero, the
     square root of the covariance turns, and points on its axes differ from others by terms of the fourth degree.
 
     With both actions 0 nothing is uncertain, and the gradient is that of the plain function.
