@@ -57,10 +57,10 @@ def on_axes(directions: int) -> Rule:
 
 @cache
 def unscented(directions: int) -> Rule:
-    """Return the middle and 2d points at ±√(d + κ) on the axes, with κ = max(0, 3 - d): exact to degree 3.
+    """Return 2d points at ±√(d + κ) on the axes and, where κ = max(0, 3 - d) > 0, the middle: exact to degree 3.
 
     Up to three directions the fourth moment along each axis is right too; beyond, κ = 3 - d would make the weight of
-    the middle negative.
+    the middle negative. For d = 3 its weight is zero, and it is left out.
 
     Source: Julier & Uhlmann, Unscented Filtering and Nonlinear Estimation, Proceedings of the IEEE 92, 2004.
     """
