@@ -46,7 +46,7 @@ def second_order(y: Any, x: Mapping[str, Any], covariance: Mapping[str, Any]) ->
 
 
 def unscented(y: Any, x: Mapping[str, Any], covariance: Mapping[str, Any]) -> Moments:
-    """Average over points on the axes of Σ, two each and up to d = 2 the middle: the mean of polynomials of degree 3 is exact.
+    """Average over points on the axes of Σ, two each, and the middle up to d = 2: means are exact to degree 3.
 
     Source: Julier & Uhlmann, Unscented Filtering and Nonlinear Estimation, Proceedings of the IEEE 92, 2004.
     """

@@ -178,6 +178,21 @@ def test_rules_of_points_are_exact_for_affine_functions_of_several_slots(rule, s
     assert_close(covariance, a @ s @ a.T + v * c @ c.T)
 
 
+@settings(max_examples=20)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_unscented_over_a_covariance_without_full_rank(seed):
+    """Six elements that two numbers decide, as a model with more outputs than inputs leaves them.
+
+    To the 1e-14 that the square root adds to each variance.
+    """
+    rng = np.random.default_rng(seed)
+    a, root, m = rng.normal(size=(2, 6)), rng.normal(size=(6, 2)), rng.normal(size=6)
+    s = root @ root.T
+    mean, covariance = moments("unscented", lambda x: ca.DM(a) @ x, {"x": (m, s)})
+    assert_close(mean, a @ m)
+    assert_close(covariance, a @ s @ a.T, 1e-12)
+
+
 @pytest.mark.parametrize("rule", ["unscented", "quadrature"])
 def test_products_of_independent_slots(rule):
     """E[xz] = mk, var[xz] = m²t + k²s + st: of degree 4 across slots, which points on the axes do not see."""
