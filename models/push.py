@@ -159,8 +159,10 @@ def state(first: Sequence[float], first_sd: float, second: Sequence[float], seco
     """What is known before the push: a mixture of two Gaussians, one of them the truth.
 
     Args:
-        first, second: (2,) where the object may be [m].
-        first_sd, second_sd: () standard deviations of that, the same in every direction [m].
+        first: (2,) where the object may be [m].
+        first_sd: () standard deviation of that, the same in every direction [m].
+        second: (2,) where it may be just as well [m].
+        second_sd: () likewise [m].
 
     Returns:
         first, second: (2,) positions [m].

@@ -91,7 +91,9 @@ def success_probability(situation: Situation, gripper: Any, theta: Any, advance:
         (...) in [0, 1].
     """
     seen = (situation.first, situation.first_sd), (situation.second, situation.second_sd)
-    return sum(0.5 * _capture_probability(in_gripper(mean, gripper, theta), sd, np.asarray(advance)) for mean, sd in seen)
+    return sum(
+        0.5 * _capture_probability(in_gripper(mean, gripper, theta), sd, np.asarray(advance)) for mean, sd in seen
+    )
 
 
 def _capture_probability(local: np.ndarray, sd: float, advance: np.ndarray) -> np.ndarray:
