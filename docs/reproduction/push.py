@@ -133,9 +133,9 @@ ROWS = {
     "network, as in the paper": Row(learned("paper", error="paper"), learned=True, trials=200),
     "network, paper": Row(learned("paper"), learned=True, trials=100),
     "network, diagonal": Row(learned("diagonal"), learned=True, trials=200),
-    "network, quadrature": Row(learned("quadrature"), learned=True, trials=200),
-    "network, split": Row(learned("split"), learned=True, trials=100),
-    "network, likelihood": Row(learned(RULE, error="likelihood"), learned=True, trials=100),
+    "network, quadrature": Row(learned("quadrature"), learned=True, trials=100),
+    "network, split": Row(learned("split"), learned=True, trials=50),
+    "network, likelihood": Row(learned(RULE, error="likelihood"), learned=True, trials=50),
 }
 
 # What the choices were made between, beside the rows above.
