@@ -1,8 +1,7 @@
 """Push an object into a gripper's funnel, with two beliefs about where it is (the paper's second toy example).
 
 Source: Yamaguchi & Atkeson, Differential Dynamic Programming for Graph-Structured Dynamical Systems,
-Humanoids 2016, section VI. The paper names no numbers but those of the reward; the others are ours, chosen so that
-its three cases come out in its order.
+Humanoids 2016, section VI. The paper names no numbers but those of the reward and the weights.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ DRAWS = 4000  # of the object, to see what a plan is worth
 SEARCH = sg.Lbfgs(starts=6, iterations=60)
 DEFAULT_SEARCH = sg.Lbfgs()
 PAPER_SEARCH = sg.Adadelta.paper()
-RULE = "low-rank"  # as good as "quadrature" and "split" on development trials, in half the time or less
+RULE = "low-rank"  # as good as "quadrature" and "split" on development trials, in less time
 
 SHOWN_ROWS = {  # in the figure
     "analytic, linear by differences, the paper's search": "analytic",
