@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import enum
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +13,7 @@ import typer
 from sims.pouring.actions import ACTIONS, SKILLS
 from sims.pouring.episode import fixed_policy, run_episode
 from sims.pouring.materials import MATERIALS
-from sims.pouring.rendering import Camera, film, strip, viewer, write_picture, write_video
+from sims.pouring.rendering import Camera, Window, film, strip, viewer, write_picture, write_video
 from sims.pouring.world import PouringWorld
 
 MaterialName = enum.StrEnum("MaterialName", list(MATERIALS))
@@ -31,7 +32,9 @@ def main(
     pour_z: Annotated[float, typer.Option(help="Shoulder above the floor.")] = 0.33,
     pictures: Annotated[Path | None, typer.Option(help="Where to write a strip of stills.")] = None,
     video: Annotated[Path | None, typer.Option(help="Where to write an .mp4 or .gif.")] = None,
-    view: Annotated[bool, typer.Option(help="Watch it in MuJoCo's viewer; needs a screen.")] = False,
+    view: Annotated[
+        bool, typer.Option(help="Watch it in MuJoCo's viewer until that is closed; needs a screen.")
+    ] = False,
 ) -> None:
     """Pour once or a few times with middling parameters."""
     world = PouringWorld(str(material), mouth)
@@ -41,25 +44,28 @@ def main(
     camera = Camera(world)
     with contextlib.ExitStack() as stack:
         frames: list = []
+        windows: list[Window] = []
 
         def begin(world: PouringWorld) -> None:
             nonlocal frames
             if view:
-                stack.enter_context(viewer(world))
+                windows.append(stack.enter_context(viewer(world)))
             if pictures or video:
                 frames = stack.enter_context(film(world, camera, FRAME_STEPS if video else STILL_STEPS))
 
         episode = run_episode(world, policy, seed, trials, begin)
-    camera.close()
-    if pictures:
-        write_picture(pictures, strip(frames))
-    if video:
-        write_video(video, frames, fps=20)
-    for stop in episode.stops:
-        typer.echo(f"trial stopped: {stop}")
-    typer.echo(f"episode: {episode.end.value if episode.end else 'left after the last trial'}")
-    for name, value in episode.metrics.items():
-        typer.echo(f"{name}: {value:g}")
+        camera.close()
+        if pictures:
+            write_picture(pictures, strip(frames))
+        if video:
+            write_video(video, frames, fps=20)
+        for stop in episode.stops:
+            typer.echo(f"trial stopped: {stop}")
+        typer.echo(f"episode: {episode.end.value if episode.end else 'left after the last trial'}")
+        for name, value in episode.metrics.items():
+            typer.echo(f"{name}: {value:g}")
+        while any(window.is_running() for window in windows):  # the end is worth a look
+            time.sleep(0.1)
 
 
 if __name__ == "__main__":
