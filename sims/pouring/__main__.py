@@ -12,8 +12,9 @@ import typer
 
 from sims.pouring.actions import ACTIONS, SKILLS
 from sims.pouring.episode import fixed_policy, run_episode
+from sims.pouring.geometry import MOUTH_RANGE
 from sims.pouring.materials import MATERIALS
-from sims.pouring.rendering import Camera, Window, film, strip, viewer, write_picture, write_video
+from sims.pouring.rendering import VIDEO_ENDINGS, Camera, Window, film, strip, viewer, write_picture, write_video
 from sims.pouring.world import PouringWorld
 
 MaterialName = enum.StrEnum("MaterialName", list(MATERIALS))
@@ -24,10 +25,10 @@ STILL_STEPS = 20  # the same where only a strip is asked for, since drawing take
 
 def main(
     material: MaterialName = MaterialName.bnc,
-    mouth: float = 0.23,
+    mouth: Annotated[float, typer.Option(min=MOUTH_RANGE[0], max=MOUTH_RANGE[1])] = 0.23,
     skill: Skill = Skill.tip,
     seed: int = 0,
-    trials: Annotated[int, typer.Option(help="Attempts after which to stop.")] = 1,
+    trials: Annotated[int, typer.Option(min=1, help="Attempts after which to stop.")] = 1,
     pour_x: Annotated[float, typer.Option(help="Shoulder from the receiver's centre.")] = -0.2,
     pour_z: Annotated[float, typer.Option(help="Shoulder above the floor.")] = 0.33,
     pictures: Annotated[Path | None, typer.Option(help="Where to write a strip of stills.")] = None,
@@ -37,6 +38,8 @@ def main(
     ] = False,
 ) -> None:
     """Pour once or a few times with middling parameters."""
+    if video and video.suffix not in VIDEO_ENDINGS:  # said now, not after the episode
+        raise typer.BadParameter(f"--video: {str(video)!r} does not end in one of {list(VIDEO_ENDINGS)}")
     world = PouringWorld(str(material), mouth)
     actions = {label: bounds.scale(0.4) for label, bounds in ACTIONS.items()}
     actions |= {"pour_position": (pour_x, pour_z), "shake_stroke": (0.06, -1.57)}

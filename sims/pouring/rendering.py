@@ -21,6 +21,7 @@ from sims.pouring.scene import CONTROL_STEP
 from sims.pouring.simulation import Simulation
 from sims.pouring.world import PouringWorld
 
+VIDEO_ENDINGS = (".mp4", ".gif")
 COLOURS = {
     SphereClass.SOURCE: (0.20, 0.45, 0.95, 1.0),
     SphereClass.FLOWING: (1.00, 0.75, 0.05, 1.0),

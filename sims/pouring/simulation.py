@@ -159,9 +159,8 @@ class Simulation:
 
     def _limit_speeds(self) -> None:
         velocities = self.velocities
-        if (
-            np.abs(velocities).max() > SPHERE_SPEED_LIMIT / 2
-        ):  # the largest component of too fast a sphere exceeds limit / sqrt(3)
+        # The largest component of too fast a sphere exceeds limit / sqrt(3).
+        if np.abs(velocities).max() > SPHERE_SPEED_LIMIT / 2:
             speeds = np.linalg.norm(velocities, axis=1)
             fast = speeds > SPHERE_SPEED_LIMIT
             velocities[fast] *= (SPHERE_SPEED_LIMIT / speeds[fast])[:, None]
