@@ -65,6 +65,8 @@ def main(
         for stop in episode.stops:
             typer.echo(f"trial stopped: {stop}")
         typer.echo(f"episode: {episode.end.value if episode.end else 'left after the last trial'}")
+        for clamp in episode.clamps:
+            typer.echo(f"clamped {clamp.label}: {clamp.asked} to {clamp.used}")
         for name, value in episode.metrics.items():
             typer.echo(f"{name}: {value:g}")
         while any(window.is_running() for window in windows):  # the end is worth a look

@@ -22,7 +22,7 @@ def test_an_episode_is_run_told_and_drawn(tmp_path):
 
 @pytest.mark.parametrize(
     ("option", "value", "words"),
-    [("--material", "oil", "oil"), ("--mouth", "0.3", "0.3 is not in the range"), ("--video", "pour.avi", ".mp4")],
+    [("--material", "oil", "oil"), ("--mouth", "0.3", "0.25"), ("--video", "pour.avi", ".mp4")],
 )
 def test_wrong_values_are_refused_before_anything_runs(option, value, words, monkeypatch):
     monkeypatch.setattr(command_line, "run_episode", None)
