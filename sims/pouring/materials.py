@@ -48,9 +48,9 @@ class Material:
 # Contacts that give back more would let a fast sphere through a wall.
 _RANGES = {"bounce": (0.05, 0.7), "friction": (0.001, 2.0), "attraction": (0.0, 1e-5), "reach": (0.05, 0.5)}
 
-# Bounce, attraction and reach are those of the published simulator. Its friction of 0.001 lets nothing jam in
-# MuJoCo, where contacts do not stick as its softer ones do: 0.35 makes viscous material jam at a mouth of
-# 0.13.
+# Bounce, attraction and reach are those of the published simulator. With its friction of 0.001 viscous material
+# often pours through a mouth of 0.13 in MuJoCo, where contacts do not stick as its softer ones do; 0.35 makes it
+# jam reliably.
 MATERIALS = {
     "wat": Material(bounce=0.1, friction=0.1, attraction=0.0, reach=0.1),
     "bnc": Material(bounce=0.7, friction=0.1, attraction=0.0, reach=0.1),
