@@ -75,6 +75,9 @@ MEASURED = (
 AT_STOP = ("received_at_stop", "released_at_stop")  # wanted of the best action sets only
 
 
+Actions = dict[str, float | tuple[float, float]]
+
+
 @dataclass(frozen=True)
 class Attempt:
     """One attempt to measure: the setup, the skill with its actions, the seed, and what it is for."""
@@ -84,7 +87,7 @@ class Attempt:
     name: str
     mouth: float
     skill: str
-    actions: dict[str, float | tuple[float, float]]
+    actions: Actions
     seed: int
 
     def columns(self) -> dict[str, object]:
@@ -199,7 +202,7 @@ def again() -> Iterator[Attempt]:
 def dependence() -> Iterator[Attempt]:
     """One action after the other varied, tipping at SETUP1 and shaking at SETUP2, 10 seeds each."""
     tip, shake = GOOD["tip"], GOOD["shake"]
-    variations: list[tuple[str, dict[str, float | tuple[float, float]]]] = [("tip", tip), ("shake", shake)]
+    variations: list[tuple[str, Actions]] = [("tip", tip), ("shake", shake)]
     variations += [("tip", {**tip, "tilt_rate": rate}) for rate in (0.010, 0.017, 0.020)]
     variations += [("tip", {**tip, "search_rate": rate}) for rate in (0.002, 0.004, 0.005)]
     variations += [("tip", {**tip, "pour_position": (x, 0.33)}) for x in (-0.29, -0.24, -0.14, -0.09)]
@@ -230,36 +233,59 @@ def search() -> Iterator[Attempt]:
 
 def finals() -> Iterator[Attempt]:
     """The best of the search, 10 seeds each."""
-    yield from _chosen("finals", ("search",), 6, range(10))
+    yield from _tried("finals", _best(("search",), 6), range(10))
+
+
+def refined() -> Iterator[Attempt]:
+    """Action sets near the best so far, 10 seeds each."""
+    generator = np.random.default_rng(2)
+    near = []
+    for skill, best in _best(("finals", "dependence"), 1):
+        for _ in range(5):
+            actions = {}
+            for label, value in best.items():
+                low, high = np.array(ACTIONS[label].low), np.array(ACTIONS[label].high)
+                moved = value + generator.uniform(-0.15, 0.15, len(low)) * (high - low)
+                drawn = np.clip(moved, low, high).round(4).tolist()
+                actions[label] = tuple(drawn) if len(drawn) > 1 else drawn[0]
+            near.append((skill, actions))
+    yield from _tried("refined", near, range(10))
 
 
 def fresh() -> Iterator[Attempt]:
-    """The best of the finals and of the varied actions, on 10 seeds that had no part in choosing them."""
-    yield from _chosen("fresh", ("finals", "dependence"), 3, range(100, 110))
+    """The best of all that was tried with 10 seeds, on 10 seeds that had no part in choosing them."""
+    yield from _tried("fresh", _best(("finals", "dependence", "refined"), 3), range(100, 110))
 
 
-def _at_setup(label: str, skill: str, actions: dict[str, float | tuple[float, float]], seed: int) -> Attempt:
+def _at_setup(label: str, skill: str, actions: Actions, seed: int) -> Attempt:
     name, mouth = SETUPS[skill]
     return Attempt(label, MATERIALS[name], name, mouth, skill, actions, seed)
 
 
-def _chosen(label: str, names: tuple[str, ...], count: int, seeds: range) -> Iterator[Attempt]:
-    """Attempts with the best action sets of each skill in measured files, judged by `keeps`."""
+def _tried(label: str, sets: Sequence[tuple[str, Actions]], seeds: range) -> Iterator[Attempt]:
+    for skill, actions in sets:
+        for seed in seeds:
+            yield _at_setup(label, skill, actions, seed)
+
+
+def _best(names: tuple[str, ...], count: int) -> list[tuple[str, Actions]]:
+    """The best action sets of each skill in measured files, judged by `keeps`."""
     groups: dict[tuple[str, ...], list[dict[str, str]]] = {}
     for file_name in names:
         with (FOLDER / f"{file_name}.csv").open(newline="") as file:
             for row in csv.DictReader(file):
                 groups.setdefault(tuple(row[name] for name in ACTION_SET), []).append(row)
-    ranked = sorted(groups.items(), key=lambda item: keeps(item[1]).cost)
-    for skill in SKILLS:
-        best = [key for key, _ in ranked if key[0] == skill][:count]
-        for key in best:
-            value = {name: float(text) for name, text in zip(ACTION_SET[1:], key[1:], strict=True) if text}
-            value |= {"pour_position": (value["px"], value["pz"])}
-            if skill == "shake":
-                value |= {"shake_stroke": (value["shake_length"], value["shake_angle"])}
-            for seed in seeds:
-                yield _at_setup(label, skill, {name: value[name] for name in GOOD[skill]}, seed)
+    ranked = sorted(groups, key=lambda key: keeps(groups[key]).cost)
+    return [(skill, _actions(key)) for skill in SKILLS for key in [key for key in ranked if key[0] == skill][:count]]
+
+
+def _actions(key: tuple[str, ...]) -> Actions:
+    """The actions of a row's `ACTION_SET`."""
+    given = {name: float(text) for name, text in zip(ACTION_SET[1:], key[1:], strict=True) if text}
+    values: Actions = given | {"pour_position": (given["px"], given["pz"])}
+    if key[0] == "shake":
+        values["shake_stroke"] = (given["shake_length"], given["shake_angle"])
+    return {name: values[name] for name in GOOD[key[0]]}
 
 
 @dataclass(frozen=True)
@@ -302,7 +328,8 @@ def measure(name: str, attempts: Iterator[Attempt]) -> None:
 
 
 EXPERIMENTS = {
-    function.__name__: function for function in (table, jamming, extremes, again, dependence, search, finals, fresh)
+    function.__name__: function
+    for function in (table, jamming, extremes, again, dependence, search, finals, refined, fresh)
 }
 
 Experiment = enum.StrEnum("Experiment", list(EXPERIMENTS))

@@ -166,7 +166,7 @@ def best() -> None:
     The last columns tell, on average, how many spheres were out but not yet received when the skill stopped at
     the target, and how many left the source afterwards.
     """
-    before = group(read("finals") + read("dependence"), action_set)
+    before = group(read("finals") + read("dependence") + read("refined"), action_set)
     lines = []
     for key, rows in group(read("fresh"), action_set).items():
         chosen, fresh = keeps(before[key]), keeps(rows)
