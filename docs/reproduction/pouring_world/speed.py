@@ -1,4 +1,4 @@
-"""Measure the attraction's share of an attempt and what a second process gains.
+"""Measure where the time of an attempt goes and what a second process gains.
 
 Run from the repository's root on an otherwise idle machine:
 `PYTHONPATH=. python docs/reproduction/pouring_world/speed.py`.
@@ -11,9 +11,10 @@ import os
 import time
 from pathlib import Path
 
+import mujoco
 import numpy as np
 
-from sims.pouring import PouringWorld, run_episodes
+from sims.pouring import MATERIALS, SKILLS, PouringWorld, run_episodes
 from sims.pouring.attraction import Attraction
 
 FOLDER = Path(__file__).parent
@@ -27,29 +28,32 @@ ACTIONS = {
 }
 
 
-def attraction_share(material: str, skill: str) -> tuple[float, float]:
-    """Return the CPU time of an attempt and the part of it that goes into the attraction."""
+def shares(material: str, skill: str) -> dict[str, float]:
+    """Return the CPU time of an attempt, and the shares of the attraction, MuJoCo's step and its solver."""
     spent = 0.0
     plain = Attraction.accelerations
 
     def timed(self: Attraction, positions: np.ndarray) -> np.ndarray:
         nonlocal spent
-        begin = time.process_time()
+        begin = time.perf_counter()
         accelerations = plain(self, positions)
-        spent += time.process_time() - begin
+        spent += time.perf_counter() - begin
         return accelerations
 
     world = PouringWorld(material, 0.17)
     world.reset(0)
+    timers = world.behaviour.simulation.data.timer
     Attraction.accelerations = timed  # type: ignore[method-assign]
-    begin = time.process_time()
+    begin, cpu = time.perf_counter(), time.process_time()
     try:
         while world.node != "poured":
             world.execute(world.node, ACTIONS, {"skill": skill})
     finally:
         Attraction.accelerations = plain  # type: ignore[method-assign]
-    total = time.process_time() - begin
-    return total, spent / total
+    cpu, total = time.process_time() - cpu, time.perf_counter() - begin
+    step = timers[mujoco.mjtTimer.mjTIMER_STEP].duration
+    solver = timers[mujoco.mjtTimer.mjTIMER_CONSTRAINT].duration
+    return {"CPU seconds": cpu, "attraction": spent / total, "MuJoCo's step": step / total, "solver": solver / total}
 
 
 def speed_up(episodes: int = 10, rounds: int = 2) -> tuple[float, float]:
@@ -67,17 +71,23 @@ def speed_up(episodes: int = 10, rounds: int = 2) -> tuple[float, float]:
     return min(times[1]), min(times[2])
 
 
+def write(name: str, rows: list[dict[str, object]]) -> None:
+    """Write a table beside this script."""
+    with (FOLDER / f"{name}.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
 if __name__ == "__main__":
-    rows: list[list[object]] = [["what", "value"]]
-    for material in ("vsc", "vsc+"):
-        for skill in ("tip", "shake"):
-            cpu, share = attraction_share(material, skill)
-            rows.append([f"{material} {skill}: CPU seconds", round(cpu, 2)])
-            rows.append([f"{material} {skill}: share of the attraction", round(share, 3)])
-    rows.append(["load average before", round(os.getloadavg()[0], 1)])
+    load = round(os.getloadavg()[0], 1)
+    rows = [
+        {"material": material, "skill": skill}
+        | {name: round(value, 3) for name, value in shares(material, skill).items()}
+        for material in MATERIALS
+        for skill in SKILLS
+    ]
+    write("speed", rows)
     one, two = speed_up()
-    rows.append(["10 episodes in one process, seconds", round(one, 2)])
-    rows.append(["10 episodes in two processes, seconds", round(two, 2)])
-    rows.append(["speed-up", round(one / two, 2)])
-    with (FOLDER / "speed.csv").open("w", newline="") as file:
-        csv.writer(file).writerows(rows)
+    times = {"10 episodes in one process": one, "in two processes": two, "speed-up": one / two}
+    write("processes", [{name: round(value, 2) for name, value in times.items()} | {"load average before": load}])
