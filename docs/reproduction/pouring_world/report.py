@@ -14,6 +14,7 @@ from pathlib import Path
 import matplotlib as mpl
 
 mpl.use("Agg")
+mpl.rcParams["svg.hashsalt"] = "pouring world"  # the same drawing gives the same file
 
 import matplotlib.pyplot as plt
 import numpy as np

@@ -11,6 +11,7 @@ import os
 import time
 from pathlib import Path
 
+import joblib
 import mujoco
 import numpy as np
 
@@ -56,19 +57,28 @@ def shares(material: str, skill: str) -> dict[str, float]:
     return {"CPU seconds": cpu, "attraction": spent / total, "MuJoCo's step": step / total, "solver": solver / total}
 
 
-def speed_up(episodes: int = 10, rounds: int = 2) -> tuple[float, float]:
-    """Return the wall-clock times of the same episodes in one and in two processes, best of the rounds."""
-    times: dict[int, list[float]] = {1: [], 2: []}
+def side_by_side(episodes: int = 10) -> list[dict[str, object]]:
+    """Time like episodes in one and in two processes."""
     setup = {"material": "wat", "mouth": 0.25}
-    run_episodes([(setup, ACTIONS, "shake", 0)] * 2, 1, 2)  # starts the processes
-    for number in range(rounds):
-        seeds = range(100 * number, 100 * number + episodes)  # none has been settled before
-        jobs = [(setup, ACTIONS, "shake", seed) for seed in seeds]
-        for processes, taken in times.items():
-            begin = time.perf_counter()
-            run_episodes(jobs, 1, processes)
-            taken.append(time.perf_counter() - begin)
-    return min(times[1]), min(times[2])
+    rows: list[dict[str, object]] = []
+    for processes in (1, 2):
+        run = joblib.Parallel(n_jobs=processes)
+        run([joblib.delayed(cpu_seconds)(setup, seed) for seed in range(processes)])  # starts the processes
+        load, begin = os.getloadavg()[0], time.perf_counter()
+        # None of these seeds has been settled before.
+        first = 1000 * processes
+        cpu = sum(run([joblib.delayed(cpu_seconds)(setup, seed) for seed in range(first, first + episodes)]))
+        taken = time.perf_counter() - begin
+        values = {"seconds": round(taken, 2), "CPU seconds": round(cpu, 2), "cores used": round(cpu / taken, 2)}
+        rows.append({"processes": processes, "episodes": episodes} | values | {"load before": round(load, 1)})
+    return rows
+
+
+def cpu_seconds(setup: dict[str, object], seed: int) -> float:
+    """Return the CPU time of an episode in the process that runs it."""
+    begin = time.process_time()
+    run_episodes([(setup, ACTIONS, "shake", seed)], 1)
+    return time.process_time() - begin
 
 
 def write(name: str, rows: list[dict[str, object]]) -> None:
@@ -80,7 +90,6 @@ def write(name: str, rows: list[dict[str, object]]) -> None:
 
 
 if __name__ == "__main__":
-    load = round(os.getloadavg()[0], 1)
     rows = [
         {"material": material, "skill": skill}
         | {name: round(value, 3) for name, value in shares(material, skill).items()}
@@ -88,6 +97,4 @@ if __name__ == "__main__":
         for skill in SKILLS
     ]
     write("speed", rows)
-    one, two = speed_up()
-    times = {"10 episodes in one process": one, "in two processes": two, "speed-up": one / two}
-    write("processes", [{name: round(value, 2) for name, value in times.items()} | {"load average before": load}])
+    write("processes", side_by_side())
