@@ -88,7 +88,9 @@ def test_fewer_folds_where_one_holds_enough(samples, expected):
 
 
 @pytest.mark.parametrize(
-    ("samples", "expected"), [(1, 150), (120, 150), (200, 250), (2_000, 2_500), (20_000, 6_000)], ids=lambda value: str(value)
+    ("samples", "expected"),
+    [(1, 150), (120, 150), (200, 250), (2_000, 2_500), (20_000, 6_000)],
+    ids=lambda value: str(value),
 )
 def test_steps_from_scratch(samples, expected):
     """As the docstring says."""
