@@ -1,5 +1,6 @@
 """Learned models: networks that predict how sure they are, fitted to samples and planned with as they are."""
 
+from symgraph.learned.calibration import Calibration, PitHistogram, Scores, calibrate
 from symgraph.learned.network import FitReport, StochasticNetwork
 
-__all__ = ["FitReport", "StochasticNetwork"]
+__all__ = ["Calibration", "FitReport", "PitHistogram", "Scores", "StochasticNetwork", "calibrate"]
