@@ -1,5 +1,6 @@
 """symgraph plans tasks that form a directed graph: skills to choose, chance, uncertainty, continuous actions."""
 
+from symgraph import learned
 from symgraph.errors import (
     CompileError,
     GraphError,
@@ -41,6 +42,7 @@ __all__ = [
     "State",
     "SymgraphError",
     "Tree",
+    "learned",
     "plot_runs",
     "plot_value",
     "solve",

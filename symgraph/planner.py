@@ -9,6 +9,7 @@ from typing import Any, overload
 import numpy as np
 
 from symgraph.errors import InputError, SolveError, did_you_mean, names
+from symgraph.exploration import explore, lacking_models
 from symgraph.objective import Objective, Situation, check_choice, checked_column, stacked_index
 from symgraph.optimizers.lbfgs import Lbfgs
 from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
@@ -32,6 +33,8 @@ def solve(
     """Find the actions and selections with the highest expected sum of rewards.
 
     The first call compiles the objective (a fraction of a second to a minute, kept on disk); later ones only search.
+    While a learned model that the plan could meet has too few samples, the plan is a random one that leads to it, and
+    its status begins with "exploring".
 
     Args:
         objective: what to maximise.
@@ -60,24 +63,27 @@ def solve(
             bar.wait("compiling")
         problem = _problem(objective, situation, guess, fixed or {}, bar)
         bar.begin("planning")
-        search = optimizer.run(problem, np.random.default_rng(seed))
+        rng = np.random.default_rng(seed)
+        selections = list(objective.graph.selections())
+        lacking = lacking_models(objective.tree, dict(zip(selections, problem.allowed, strict=True)))
+        search = explore(problem, selections, lacking, rng) if lacking else optimizer.run(problem, rng)
     best = best_of(search.runs)
     if best is None:
         if search.interrupted:
             raise KeyboardInterrupt
         raise SolveError(_why_not_finite(objective, situation, search))
-    selections = _selections(objective, best)
-    nodes = objective.outcomes_of(situation, best.point, selections)
+    chosen = _selections(objective, best)
+    nodes = objective.outcomes_of(situation, best.point, chosen)
     planned_or_seen: dict[str, Action | State] = {**objective.graph.actions(), **objective.graph.states()}
     return Plan(
         actions=objective.unstack(best.point),
-        selections=selections,
+        selections=chosen,
         value=best.value,
         status=f"interrupted: best of {len(search.runs)} runs" if search.interrupted else search.status,
         notes=(*_held_outside(objective, fixed or {}), *nodes.notes()),
         nodes=nodes,
         runs=_Runs(objective, search.runs),
-        optimizer=type(optimizer).__name__,
+        optimizer="uniform draw" if lacking else type(optimizer).__name__,
         seed=int(seed),
         seconds=time.perf_counter() - begin,
         units={label: slot.unit for label, slot in planned_or_seen.items() if slot.unit},

@@ -36,6 +36,7 @@ LAYERS = [
     "objective",
     "progress",
     "optimizers",
+    "exploration",
     "plan",
     "planner",
     "plots",

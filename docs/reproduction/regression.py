@@ -263,7 +263,7 @@ class Ours:
 
 
 METHODS = {
-    # The default is what a user gets who chooses nothing, and comes first; the smaller is more usual for so few samples.
+    # The default is what a user gets who chooses nothing; the smaller one is more usual for so few samples.
     "symgraph (200, 200, 200)": lambda: Ours((200, 200, 200)),
     "symgraph (50, 50)": lambda: Ours((50, 50)),
     "Gaussian process": GaussianProcess,

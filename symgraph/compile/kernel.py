@@ -9,7 +9,7 @@ from typing import Literal
 
 from symgraph.slots import Array
 
-Outcome = Literal["converged", "iteration limit", "oscillation", "stalled", "not finite", "worker died"]
+Outcome = Literal["converged", "iteration limit", "oscillation", "stalled", "not finite", "worker died", "drawn"]
 
 
 @dataclass(frozen=True)

@@ -70,17 +70,25 @@ def pass_through(rule: str, layers: Layers, mean: ca.MX, root: ca.MX | None) -> 
     return RULES[rule](layers, mean, root)
 
 
-def pass_error(rule: str, layers: Layers, mean: ca.MX, root: ca.MX | None) -> Mixture:
-    """Return the output of a network whose output's average matters and not its spread: cheaper where that is the same.
+def splits(rule: str, root: ca.MX | None) -> bool:
+    """Whether a rule splits the input into components."""
+    return root is not None and (rule == "split" or (rule == "auto" and root.shape[1] <= MOST_SPLIT))
+
+
+def at_points(layers: Layers, mean: ca.MX, root: ca.MX) -> Mixture:
+    """Evaluate the network at the points that "split" uses."""
+    rule, _ = _splitting(root.shape[1])
+    return _points(layers, _moved(mean, root, rule), rule.weights)
+
+
+def pass_cheaply(rule: str, layers: Layers, mean: ca.MX, root: ca.MX | None) -> Mixture:
+    """Return the output of a network of which an average matters and no spread: what gives that for less.
 
     Where the rule splits, the network is evaluated at the points; where it keeps covariances, they are dropped here.
     """
     if root is None or rule in ("mean", "paper", "quadrature"):
         return pass_through(rule, layers, mean, root)
-    if rule == "split" or (rule == "auto" and root.shape[1] <= MOST_SPLIT):
-        points, _ = _splitting(root.shape[1])
-        return _points(layers, _moved(mean, root, points), points.weights)
-    return _diagonal(layers, mean, root)
+    return at_points(layers, mean, root) if splits(rule, root) else _diagonal(layers, mean, root)
 
 
 def _points(layers: Layers, columns: ca.MX, weights: Array) -> Mixture:
@@ -203,7 +211,7 @@ def _splitting(directions: int) -> tuple[cubature.Rule, float]:
 
 def _auto(layers: Layers, mean: ca.MX, root: ca.MX) -> Mixture:
     """Split where the uncertain directions are few; beyond, the spread along each matters less, and costs more."""
-    return (_split if root.shape[1] <= MOST_SPLIT else _low_rank)(layers, mean, root)
+    return (_split if splits("auto", root) else _low_rank)(layers, mean, root)
 
 
 MOST_SPLIT = 6  # uncertain directions that "auto" splits along

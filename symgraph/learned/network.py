@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,16 +14,9 @@ from symgraph.compile.interpreted import FlatFunction
 from symgraph.cubature import gauss_hermite, square_root
 from symgraph.errors import InputError
 from symgraph.learned import losses
-from symgraph.learned.gaussians import RULES, Mixture, pass_error, pass_through
-from symgraph.learned.inputs import (
-    checked_count,
-    checked_hidden,
-    checked_option,
-    checked_pair,
-    checked_rows,
-    checked_sizes,
-    mean_and_root,
-)
+from symgraph.learned.base import Experience, LearnedModel
+from symgraph.learned.gaussians import Mixture, pass_cheaply, pass_through
+from symgraph.learned.inputs import checked_option, checked_pair, checked_rows, checked_sizes, mean_and_root
 from symgraph.learned.learner import Learner, Memory
 from symgraph.learned.perceptron import Perceptron, Scaling
 from symgraph.model import Parameter
@@ -62,17 +54,16 @@ class FitReport:
 
 
 @dataclass
-class Experience:
-    """What a network keeps between fits; shared by its views under other propagation rules."""
+class NetworkExperience(Experience):
+    """The learners of mean and error, and where their networks stand."""
 
-    samples: int = 0
     mean_learner: Learner = field(default_factory=Learner)
     error_learner: Learner = field(default_factory=Learner)
     mean: Memory | None = None
     error: Memory | None = None
 
 
-class StochasticNetwork:
+class StochasticNetwork(LearnedModel):
     """A network of rectified linear units that predicts a mean and its own error, and propagates Gaussians.
 
     y ~ N(f(x), diag(σ²(x))) for an exact x; for x ~ N(μ, Σ) mean and covariance of f are propagated through the layers
@@ -106,45 +97,25 @@ class StochasticNetwork:
         samples_needed: int = 3,
         name: str = "network",
     ) -> None:
-        self.name = str(name)
-        self.reads = checked_sizes(reads, f"{self.name}: reads")
+        super().__init__(reads, hidden, propagation, samples_needed, name)
         self.writes = checked_sizes(writes, f"{self.name}: writes")
-        self.hidden = checked_hidden(hidden, f"{self.name}: hidden")
-        self.propagation = checked_option(propagation, RULES, f"{self.name}: propagation")
         self.error = checked_option(error, ERROR_MODELS, f"{self.name}: error")
-        self.samples_needed = checked_count(samples_needed, f"{self.name}: samples_needed")
         sizes = (sum(self.reads.values()), *self.hidden, sum(self.writes.values()))
         self._mean = Perceptron(sizes, f"{self.name}_mean")
         self._error = Perceptron(sizes, f"{self.name}_error")
         self._error_scale = Parameter(np.ones(sizes[-1]), f"{self.name}_error_scale")  # [units of the outputs]
-        self._experience = Experience()
+        self._experience: NetworkExperience = NetworkExperience()
         self._built: dict[str, FlatFunction] = {}  # (mean, covariance) → (mean, covariance), by rule
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """The weights, which enter an objective as its parameters: a fit changes them, and nothing is rebuilt."""
+        """The weights of both networks."""
         if self.error == "none":
             return self._mean.parameters
         return (*self._mean.parameters, *self._error.parameters, self._error_scale)
 
-    @property
-    def samples(self) -> int:
-        """How many samples the last fit had."""
-        return self._experience.samples
-
-    @property
-    def lacking(self) -> str | None:
-        """What is missing before it can be used, e.g. "2 of 3 samples"; None when nothing is."""
-        return None if self.samples >= self.samples_needed else f"{self.samples} of {self.samples_needed} samples"
-
-    def with_propagation(self, rule: str) -> StochasticNetwork:
-        """Return a view under another rule: the same weights, now and after further fits."""
-        view = copy.copy(self)
-        view.propagation = checked_option(rule, RULES, f"{self.name}: propagation")
-        return view
-
     def propagate(self, inputs: Mapping[str, Gaussian]) -> dict[str, Gaussian]:
-        """Return {label: Gaussian} of what it writes, as expressions of its parameters; see `Propagator`."""
+        """Return the Gaussians of what it writes, as expressions of its parameters."""
         y, covariance = self._moments(*mean_and_root([inputs[label] for label in self.reads]))
         written, at = {}, 0
         for label, size in self.writes.items():
@@ -256,7 +227,7 @@ class StochasticNetwork:
         passed = pass_through(self.propagation, self._mean.layers, mean, root)
         if self.error == "none":
             return passed.mean, passed.covariance
-        errors = pass_error(self.propagation, self._error.layers, mean, root)
+        errors = pass_cheaply(self.propagation, self._error.layers, mean, root)
         scale = self._error_scale.symbol
         variance = errors.mean**2 if self.error == "paper" else _expected_square(errors)
         return passed.mean, passed.covariance + ca.diag(variance * scale**2)
@@ -274,10 +245,6 @@ class StochasticNetwork:
 
     def __getstate__(self) -> dict[str, Any]:  # CasADi's functions are built anew, with the parameters' new symbols
         return {**self.__dict__, "_built": {}}
-
-    def __repr__(self) -> str:
-        reads, writes = ", ".join(self.reads), ", ".join(self.writes)
-        return f"StochasticNetwork({self.name}: {reads} → {writes}, hidden {self.hidden}, {self.samples} samples)"
 
 
 def _expected_square(errors: Mixture) -> ca.MX:

@@ -1,0 +1,73 @@
+"""Exploration: what to do while a model knows too little to be planned with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from symgraph.binding import BoundModel
+from symgraph.optimizers.problem import Problem, Run, Search
+from symgraph.tree import Tree
+
+MOST_DRAWS = 100  # until one has a finite value
+
+Decisions = Mapping[str, int]  # selection → which of its choices
+
+
+def lacking_models(tree: Tree, allowed: Mapping[str, tuple[int, ...]]) -> dict[BoundModel, Decisions]:
+    """Return the models that allowed choices can lead to and that lack samples, each with the choices on a way there.
+
+    Args:
+        tree: the unrolled graph.
+        allowed: {selection: the choices that are not ruled out}.
+    """
+    selections = tree.graph.selections()
+    found: dict[BoundModel, Decisions] = {}
+    ways: dict[int, Decisions] = {0: {}}
+
+    def note(model: BoundModel | None, way: Decisions) -> None:
+        if model is not None and model.lacking is not None:
+            found.setdefault(model, way)
+
+    for node in tree.nodes:
+        if node.index not in ways:
+            continue
+        here = ways[node.index]
+        for group in node.groups:
+            probability = group.group.probability
+            note(probability if isinstance(probability, BoundModel) else None, here)
+            for branch in group.branches:
+                way = here
+                if group.group.kind == "choose":
+                    selection = str(group.group.selection)
+                    choice = selections[selection].choices.index(branch.branch.label)
+                    if choice not in allowed[selection]:
+                        continue
+                    way = {**here, selection: choice}
+                note(branch.branch.model, way)
+                if branch.child is not None:
+                    ways[branch.child] = way
+    return found
+
+
+def explore(
+    problem: Problem, selections: list[str], lacking: Mapping[BoundModel, Decisions], rng: np.random.Generator
+) -> Search:
+    """Draw actions and choices at random, with the choices that lead to a model that lacks samples.
+
+    Source: Yamaguchi & Atkeson, Humanoids 2016, section VII-A: if no model is available, the actions are random.
+    """
+    ways = list(lacking.values())
+    runs = []
+    for _ in range(MOST_DRAWS):
+        choices = problem.draw_choices(rng, 1, evenly=False)
+        for label, choice in ways[rng.integers(len(ways))].items():
+            choices[0, selections.index(label)] = choice
+        points = problem.draw_points(rng, 1, "uniform")
+        value = float(problem.values(points, choices)[0])
+        runs.append(Run(points[0], points[0], choices[0], value, "drawn", np.array([value])))
+        if np.isfinite(value):
+            break
+    needs = dict.fromkeys(f"model {model.name!r} has {model.lacking}" for model in lacking)
+    return Search(runs, f"exploring: {', '.join(needs)}")

@@ -1,0 +1,181 @@
+"""BranchNetwork: which branch of a chance happens, learned from what did."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from symgraph.cubature import square_root, unscented
+from symgraph.errors import InputError, did_you_mean, names
+from symgraph.learned import losses
+from symgraph.learned.base import Experience, LearnedModel
+from symgraph.learned.gaussians import at_points, pass_through, splits
+from symgraph.learned.inputs import checked_pair, checked_rows, mean_and_root
+from symgraph.learned.learner import Learner, Memory
+from symgraph.learned.perceptron import Perceptron, Scaling
+from symgraph.model import Parameter
+from symgraph.progress import Progress
+from symgraph.slots import Array, Gaussian
+
+
+@dataclass(frozen=True)
+class BranchReport:
+    """What a fit did.
+
+    Attributes:
+        samples: how many there were.
+        warm: whether it went on from the weights of the fit before.
+        steps: of the network.
+        log_loss: mean of -log(probability of what happened), on samples that were left out.
+        seconds: wall time [s].
+    """
+
+    samples: int
+    warm: bool
+    steps: int
+    log_loss: float
+    seconds: float
+
+    def __str__(self) -> str:
+        how = "warm" if self.warm else "from scratch"
+        return (
+            f"{self.samples} samples, {how}, {self.steps} steps in {self.seconds:.2f} s; "
+            f"held-out log loss {self.log_loss:.3g}"
+        )
+
+
+@dataclass
+class BranchExperience(Experience):
+    """The learner, and where the network stands."""
+
+    learner: Learner = field(default_factory=Learner)
+    memory: Memory | None = None
+
+
+class BranchNetwork(LearnedModel):
+    """A network that gives each branch of a chance its probability, for `graph.chance(…, probability=…)`.
+
+    p = softmax(f(x)); for x ~ N(μ, Σ) the expectation E[p] over what is propagated. The probabilities are positive and
+    sum to 1.
+
+    Args:
+        reads: {label: number of elements} of the inputs, in the order of the columns of x.
+        branches: the names of the branches.
+        hidden: units in each hidden layer.
+        propagation: how Gaussians pass, as in `StochasticNetwork`.
+        samples_needed: with fewer, plans that need the network explore.
+        name: shown in messages and pictures.
+
+    Raises:
+        InputError: labels, branches or options that make no network.
+
+    Source: the bifurcation models F^P of Yamaguchi & Atkeson, Humanoids 2016, section II-A.
+    """
+
+    def __init__(
+        self,
+        reads: Mapping[str, int],
+        branches: Sequence[str],
+        hidden: Sequence[int] = (200, 200),
+        *,
+        propagation: str = "auto",
+        samples_needed: int = 3,
+        name: str = "branches",
+    ) -> None:
+        super().__init__(reads, hidden, propagation, samples_needed, name)
+        listed = () if isinstance(branches, str) else tuple(branches)
+        if len(set(listed)) < max(2, len(listed)) or not all(isinstance(b, str) and b for b in listed):
+            raise InputError(f"{self.name}: branches = {branches!r}; give two or more different names")
+        self.writes = listed
+        self._logits = Perceptron((sum(self.reads.values()), *self.hidden, len(listed)), self.name)
+        self._experience: BranchExperience = BranchExperience()
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The weights of the network."""
+        return self._logits.parameters
+
+    def propagate(self, inputs: Mapping[str, Gaussian]) -> dict[str, Gaussian]:
+        """Return {branch: its probability}, as expressions of its parameters."""
+        mean, root = mean_and_root([inputs[label] for label in self.reads])
+        if root is not None and splits(self.propagation, root):
+            passed = at_points(self._logits.layers, mean, root)
+        else:
+            passed = pass_through(self.propagation, self._logits.layers, mean, root)
+        columns, weights = passed.means, passed.weights
+        if passed.within is not None:  # one Gaussian of logits, over which the softmax is averaged
+            rule = unscented(len(self.writes))
+            columns = ca.repmat(passed.mean, 1, len(rule.weights))
+            columns += ca.mtimes(square_root(passed.covariance), ca.DM(rule.points))
+            weights = rule.weights
+        p = ca.mtimes(_softmax(columns), ca.DM(weights))
+        return {branch: Gaussian(p[i]) for i, branch in enumerate(self.writes)}
+
+    def predict(self, mean: Any) -> Array:
+        """Return the probabilities (N, branches) at exact inputs (N, n), or (branches,) at (n,).
+
+        Raises:
+            InputError: an array of another shape.
+        """
+        single = np.ndim(mean) == 1
+        logits = self._logits(checked_rows([mean] if single else mean, self._logits.sizes[0], f"{self.name}: mean"))
+        likelihoods = np.exp(logits - logits.max(axis=1, keepdims=True))
+        p: Array = likelihoods / likelihoods.sum(axis=1, keepdims=True)
+        return p[0] if single else p
+
+    def fit(self, x: Any, happened: Sequence[str], *, seed: int = 0, progress: bool = True) -> BranchReport:
+        """Learn from what happened; a further call goes on from the weights there are.
+
+        Args:
+            x: (N, n) inputs in the order of `reads` [their units].
+            happened: N names of branches.
+            seed: of all that is random.
+            progress: show a progress bar where it takes longer than two seconds.
+
+        Raises:
+            InputError: arrays of other shapes, numbers that are not finite, unknown branches.
+            MissingExtraError: torch is not installed.
+        """
+        begin = time.perf_counter()
+        x = checked_rows(x, self._logits.sizes[0], f"{self.name}: x")
+        happened = list(happened)
+        checked_pair(x, happened, self.name)
+        unknown = [b for b in happened if b not in self.writes]
+        if unknown:
+            hint = did_you_mean(unknown[0], self.writes)
+            raise InputError(f"{self.name}: {unknown[0]!r} is no branch{hint} Branches: {names(self.writes)}")
+        hot = np.array([[float(b == branch) for branch in self.writes] for b in happened])
+        kept, scaling = self._experience, (Scaling.of(x), None)
+        frequency = (hot.sum(axis=0) + 1.0) / (len(hot) + len(self.writes))  # Laplace's: no branch is impossible
+        with Progress(f"fitting {self.name}", progress) as bar:
+            schedule = kept.learner.schedule(x, hot)
+            kept.memory, trained = kept.learner.fit(
+                kept.memory,
+                self._logits.sizes,
+                x,
+                hot,
+                scaling,
+                losses.cross_entropy,
+                schedule,
+                np.random.default_rng(seed),
+                bar,
+                np.log(frequency),
+            )
+        self._logits.set(kept.memory.copies, *scaling)
+        kept.samples = len(x)
+        return BranchReport(len(x), schedule.warm, trained.steps, trained.loss, time.perf_counter() - begin)
+
+
+def _softmax(columns: ca.MX) -> ca.MX:
+    """Return the softmax of each column, the largest of which is taken out so that nothing overflows."""
+    rows = ca.vertsplit(columns)
+    largest = rows[0]
+    for row in rows[1:]:
+        largest = ca.fmax(largest, row)
+    likelihoods = ca.exp(columns - ca.repmat(largest, len(rows), 1))
+    return likelihoods / ca.repmat(ca.sum1(likelihoods), len(rows), 1)
