@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from symgraph.errors import InputError, MissingExtraError
+from symgraph.errors import InputError, MissingExtraError, SlotError
 from symgraph.learned.inputs import checked_count, checked_pair, checked_rows
 from symgraph.slots import Array, as_numbers
 
@@ -159,7 +159,10 @@ def calibrate(network: Predictor, x: Any, y: Any, *, bins: int = 10) -> Calibrat
         MissingExtraError: scoringrules is not installed.
     """
     labels = _elements(network.writes)
-    columns = as_numbers(x, "x")
+    try:
+        columns = as_numbers(x, "x")
+    except SlotError as error:
+        raise InputError(str(error)) from None
     columns = columns[:, None] if columns.ndim == 1 else columns
     x = checked_rows(columns, columns.shape[-1] if columns.ndim == 2 else 1, "x")
     y = checked_rows(y, len(labels), "y")
@@ -194,8 +197,10 @@ def _elements(writes: Mapping[str, int] | Iterable[str]) -> list[str]:
     return [label if size == 1 else f"{label}[{element}]" for label, size in sizes.items() for element in range(size)]
 
 
-def _checked_predictions(predicted: tuple[Any, Any], shape: tuple[int, ...]) -> tuple[Array, Array]:
+def _checked_predictions(predicted: Any, shape: tuple[int, ...]) -> tuple[Array, Array]:
     n, m = shape
+    if not isinstance(predicted, tuple) or len(predicted) != 2:
+        raise InputError(f"predict returned a {type(predicted).__name__}; return a pair, means and covariances")
     mean, covariance = (np.asarray(array, dtype=float) for array in predicted)
     if mean.shape != (n, m) or covariance.shape != (n, m, m):
         raise InputError(
@@ -269,10 +274,13 @@ def _cells(scores: Scores) -> list[str]:
 
 def _draw_histogram(axes: Axes, label: str, histogram: PitHistogram) -> None:
     bins = len(histogram.counts)
-    axes.axhspan(histogram.low, histogram.high, color="black", alpha=0.12, lw=0, label=f"uniform, {BAND:.0%}")
-    axes.stairs(histogram.counts, np.linspace(0.0, 1.0, bins + 1), fill=True, color="C0", alpha=0.8)
-    axes.set(xlim=(0, 1), title=label, xlabel="PIT = Φ((y − mean) / sd)", ylabel="samples")
-    axes.legend(frameon=False)
+    edges, top = np.linspace(0.0, 1.0, bins + 1), 1.3 * max(histogram.high, int(histogram.counts.max()))
+    axes.stairs(histogram.counts, edges, fill=True, color="C0", alpha=0.5)
+    axes.axhspan(
+        histogram.low, histogram.high, color="black", alpha=0.15, lw=0, label=f"band of uniform PITs, {BAND:.0%}"
+    )
+    axes.set(xlim=(0, 1), ylim=(0, top), title=label, xlabel="PIT = Φ((y − mean) / sd)", ylabel="samples")
+    axes.legend(frameon=False, loc="upper center")
 
 
 def _draw_deviations(axes: Axes, label: str, errors: Array, sd: Array) -> None:
