@@ -27,11 +27,12 @@ def fitted_branches():
 
 
 def same(a, b):
-    """Whether two models are equal in all that decides predictions and further fits."""
+    """A model that was loaded equals another in all that decides predictions and further fits."""
     assert a._settings == b._settings
     assert a.samples == b.samples
     for p, q in zip(a.parameters, b.parameters, strict=True):
         np.testing.assert_array_equal(p.value, q.value)
+        assert p.value.flags.f_contiguous  # as a fit leaves them
     assert list(a._networks) == list(b._networks)
     for (learner, memory), (other_learner, other) in zip(a._networks.values(), b._networks.values(), strict=True):
         assert learner.begun_with == other_learner.begun_with

@@ -106,7 +106,7 @@ class LearnedModel(ABC):
         except InputError as error:
             raise storage.damaged(path, str(error)) from None
         for parameter, value in zip(model.parameters, stored.parameters, strict=True):
-            parameter.value = np.asfortranarray(value)  # as a fit leaves them, since sums depend on the layout
+            parameter.value = np.asfortranarray(value)  # the layout that a fit gives them
         model._resume(stored.samples, stored.networks)
         return model
 

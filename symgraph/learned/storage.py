@@ -103,7 +103,7 @@ def read(path: str | os.PathLike[str], kind: str, expected: Callable[[Document],
         if not stat.S_ISREG(path.stat().st_mode):
             raise StorageError(f"{path} is not a file; give the path that `save` was given")
         with path.open("rb") as file:
-            data, document, tensors = _checked(path, file, kind, expected)
+            data, document = _checked(path, file, kind, expected)
     except OSError as error:
         if isinstance(error, StorageError):
             raise
@@ -113,11 +113,9 @@ def read(path: str | os.PathLike[str], kind: str, expected: Callable[[Document],
     except MemoryError:
         raise StorageError(f"{path}: too large for this machine's memory") from None
     try:
-        # Copies of their own: aligned, writable, and independent of what else was read.
-        arrays = {name: array.copy() for name, array in safetensors.numpy.load(data).items()}
+        arrays = safetensors.numpy.load(data)
     except safetensors.SafetensorError as error:
         raise damaged(path, str(error)) from None
-    arrays = {name: arrays[name] for name in tensors}
     if document.pop("digest", None) != _digest(document, arrays):
         raise damaged(path, "its contents do not have the digest that they were saved with")
     for name, array in arrays.items():
@@ -126,28 +124,27 @@ def read(path: str | os.PathLike[str], kind: str, expected: Callable[[Document],
     return document, arrays
 
 
-def _checked(
-    path: Path, file: BinaryIO, kind: str, expected: Callable[[Document], Specs]
-) -> tuple[bytes, Document, Specs]:
-    """Return a file's bytes, its document and its tensors; nothing large is read before all lengths agree."""
+def _checked(path: Path, file: BinaryIO, kind: str, expected: Callable[[Document], Specs]) -> tuple[bytes, Document]:
+    """Return a file's bytes and its document; nothing large is read before all lengths agree."""
     size = os.fstat(file.fileno()).st_size
     if size > MOST_BYTES:
         raise StorageError(f"{path} has {size} bytes, more than the {MOST_BYTES} of any model; {REMEDY}")
     start = file.read(8)
     header_size = int.from_bytes(start, "little")
-    if len(start) < 8 or header_size > min(MOST_HEADER, size - 8):
+    if len(start) < 8 or header_size > size - 8:
         raise damaged(path, "it is no safetensors file, or one that was cut off")
+    if header_size > MOST_HEADER:
+        raise damaged(path, f"its header has {header_size} bytes, more than the {MOST_HEADER} of any model")
     header = file.read(header_size)
     try:
         table, document = _parsed(path, header, kind)
-        specs = expected(document)
-        _check_table(table, specs, size - 8 - header_size)
+        _check_table(table, expected(document), size - 8 - header_size)
     except (InputError, RecursionError) as error:  # nested a thousand deep
         raise damaged(path, str(error)) from None
     data = start + header + file.read(size - 8 - header_size)
     if len(data) != size:
         raise damaged(path, "it became shorter while it was read")
-    return data, document, specs
+    return data, document
 
 
 def _parsed(path: Path, header: bytes, kind: str) -> tuple[Document, Document]:
