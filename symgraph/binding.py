@@ -19,6 +19,8 @@ from symgraph.slots import Array, Gaussian, Slot, State, as_covariance
 
 REWARD = "reward"  # the one thing a reward model returns
 
+SCALAR_LIMIT = 50_000  # instructions up to which a model is written out scalar by scalar
+
 # The rule of a plain function that does not name one.
 DEFAULT_PROPAGATION = {"edge": "linear", "probability": "linear", "reward": "second-order"}
 
@@ -90,13 +92,20 @@ class BoundModel:
         return self._built[uncertain]
 
     def _build_function(self, uncertain: tuple[str, ...]) -> ca.Function:
-        # SX evaluates scalar by scalar and is far faster; MX serves functions that call what SX cannot hold.
+        # SX evaluates scalar by scalar and is far faster; MX serves functions that call what SX cannot hold, and those
+        # with large matrices, whose products written out would keep the C compiler busy for minutes.
         try:
-            kind: Any = ca.SX
-            x, y = self._trace(kind)
+            traced = self._trace(ca.SX)
         except Exception:
-            kind = ca.MX
-            x, y = self._trace(kind)
+            return self._moments_in(ca.MX, *self._trace(ca.MX), uncertain)
+        function = self._moments_in(ca.SX, *traced, uncertain)
+        if function.n_instructions() <= SCALAR_LIMIT:
+            return function
+        return self._moments_in(ca.MX, *self._trace(ca.MX), uncertain)
+
+    def _moments_in(
+        self, kind: Any, x: Mapping[str, Any], y: Mapping[str, Any], uncertain: tuple[str, ...]
+    ) -> ca.Function:
         sigma = {label: kind.sym(f"{label}_cov", self._sizes[label], self._sizes[label]) for label in uncertain}
         moments = [RULES[str(self._rule)](y[label], x, sigma) for label in self.writes]
         covariances = [

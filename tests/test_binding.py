@@ -393,3 +393,21 @@ def test_propagator_may_call_what_sx_cannot_hold():
     graph.edge("here", "next", Table())
     graph.reward("next", lambda y: y)
     assert objective_of(graph).value({"x": sg.Gaussian(2.0, 1.0)}) == 3.0
+
+
+def test_models_with_large_matrices_are_not_written_out():
+    """Products of constant matrices stay products: scalar by scalar they would be 120,000 instructions."""
+    rng = np.random.default_rng(0)
+    first, second = rng.normal(size=(200, 3)), rng.normal(size=(200, 200))
+
+    def network(x):
+        return {"y": ca.sum1(ca.DM(second) @ ca.tanh(ca.DM(first) @ x))}
+
+    graph = sg.Graph({"x": sg.State(3), "y": sg.State()}, start="here")
+    graph.edge("here", "there", network)
+    graph.reward("there", lambda y: y)
+    (model,) = [m for m in sg.unroll(graph).models if m.name == "network"]
+    assert model.function_for(()).n_instructions() < 50
+    mean = np.array([0.1, -0.2, 0.3])
+    value = sg.Objective(sg.unroll(graph), compiled=False).value({"x": mean})
+    assert value == pytest.approx(np.sum(second @ np.tanh(first @ mean)), rel=1e-12)

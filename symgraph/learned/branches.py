@@ -10,11 +10,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from symgraph.cubature import square_root, unscented
+from symgraph.cubature import gauss_hermite, on_axes, square_root
 from symgraph.errors import InputError, did_you_mean, names
 from symgraph.learned import losses
 from symgraph.learned.base import Experience, LearnedModel, layer_sizes
-from symgraph.learned.gaussians import at_points, pass_through, splits
+from symgraph.learned.gaussians import Mixture, at_points, pass_through, splits
 from symgraph.learned.inputs import checked_pair, checked_rows, mean_and_root
 from symgraph.learned.learner import Learner, Memory
 from symgraph.learned.perceptron import Perceptron, Scaling
@@ -22,6 +22,8 @@ from symgraph.learned.snapshot import Layout, layer_shapes
 from symgraph.model import Parameter
 from symgraph.progress import Progress
 from symgraph.slots import Array, Gaussian
+
+HERMITE = {1: 9, 2: 7}  # points for each difference of logits, by their number
 
 
 @dataclass(frozen=True)
@@ -108,13 +110,7 @@ class BranchNetwork(LearnedModel):
             passed = at_points(self._logits.layers, mean, root)
         else:
             passed = pass_through(self.propagation, self._logits.layers, mean, root)
-        columns, weights = passed.means, passed.weights
-        if passed.within is not None:  # one Gaussian of logits, over which the softmax is averaged
-            rule = unscented(len(self.writes))
-            columns = ca.repmat(passed.mean, 1, len(rule.weights))
-            columns += ca.mtimes(square_root(passed.covariance), ca.DM(rule.points))
-            weights = rule.weights
-        p = ca.mtimes(_softmax(columns), ca.DM(weights))
+        p = _expected_softmax(passed)
         return {branch: Gaussian(p[i]) for i, branch in enumerate(self.writes)}
 
     def predict(self, mean: Any) -> Array:
@@ -189,6 +185,22 @@ class BranchNetwork(LearnedModel):
 
     def _resume(self, samples: int, networks: Mapping[str, tuple[Learner, Memory | None]]) -> None:
         self._experience = BranchExperience(samples, *networks["logits"])
+
+
+def _expected_softmax(logits: Mixture) -> ca.MX:
+    """Return E[softmax] (m, 1) over points or over one Gaussian.
+
+    Only differences of logits matter, which are one fewer.
+    """
+    if logits.within is None:
+        return ca.mtimes(_softmax(logits.means), ca.DM(logits.weights))
+    m = logits.means.shape[0]
+    differences = ca.DM(np.hstack([np.eye(m - 1), -np.ones((m - 1, 1))]))
+    order = HERMITE.get(m - 1)
+    rule = gauss_hermite(m - 1, order) if order else on_axes(m - 1)
+    root = square_root(ca.mtimes([differences, logits.covariance, differences.T]))
+    columns = ca.repmat(ca.mtimes(differences, logits.mean), 1, len(rule.weights)) + ca.mtimes(root, ca.DM(rule.points))
+    return ca.mtimes(_softmax(ca.vertcat(columns, ca.MX(1, len(rule.weights)))), ca.DM(rule.weights))
 
 
 def _softmax(columns: ca.MX) -> ca.MX:

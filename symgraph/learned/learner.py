@@ -54,7 +54,8 @@ class Learner:
     """Keeps folds and decides, fit by fit, whether to go on from the weights there are.
 
     A warm start is quick, but networks that began on few samples generalise worse than fresh ones (Ash & Adams, On
-    warm-starting neural network training, NeurIPS 2020). So a fit begins anew whenever the samples have grown by half.
+    warm-starting neural network training, NeurIPS 2020). So a fit begins anew whenever the samples have grown by half,
+    or when more than a third of them are new.
     """
 
     def __init__(self) -> None:
@@ -64,7 +65,7 @@ class Learner:
     def schedule(self, *columns: Array) -> Schedule:
         """Plan a fit to samples (N, …)."""
         n = len(columns[0])
-        warm = 0 < self.begun_with <= n < GROWTH * self.begun_with
+        warm = 0 < self.begun_with <= n < GROWTH * self.begun_with and self.folds.count_known(*columns) > n / GROWTH
         if not warm:
             self.begun_with = n
             self.folds = Folds()

@@ -70,14 +70,21 @@ class Folds:
 
     def assign(self, *columns: Array) -> npt.NDArray[np.int64]:
         """Return the fold (N,) of each sample, dealing new ones to the folds with the fewest samples."""
-        rows = np.ascontiguousarray(np.hstack(columns))
-        digests = [hashlib.blake2b(row.tobytes(), digest_size=8).digest() for row in rows]
+        digests = _digests(columns)
         sizes = np.bincount([self.known[d] for d in digests if d in self.known], minlength=FOLDS)
         # In the order of their digests, which is as good as random.
         for digest in sorted(set(digests).difference(self.known)):
             self.known[digest] = int(sizes.argmin())
             sizes[self.known[digest]] += 1
         return np.array([self.known[d] for d in digests], dtype=np.int64)
+
+    def count_known(self, *columns: Array) -> int:
+        """Return how many of the samples have a fold already."""
+        return sum(digest in self.known for digest in _digests(columns))
+
+
+def _digests(columns: Sequence[Array]) -> list[bytes]:
+    return [hashlib.blake2b(row.tobytes(), digest_size=8).digest() for row in np.ascontiguousarray(np.hstack(columns))]
 
 
 def active_folds(samples: int) -> int:

@@ -1,0 +1,431 @@
+"""StochasticNetwork as its users meet it: what it predicts, how it is fitted, what a graph computes with it."""
+
+import pickle
+import subprocess
+import sys
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import symgraph as sg
+from symgraph.learned import StochasticNetwork
+from symgraph.learned.gaussians import RULES
+
+ERRORS = ["likelihood", "paper", "none"]
+
+
+def samples(count=60, seed=0):
+    """Noisy samples of two functions of three inputs, of very different sizes."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-1.0, 1.0, (count, 3)) * [1.0, 100.0, 0.01] + [0.0, 500.0, 0.0]
+    z = (x - [0.0, 500.0, 0.0]) / [1.0, 100.0, 0.01]
+    y = np.column_stack([1000.0 * np.sin(2.0 * z[:, 0]) * z[:, 1], 0.01 * z[:, 2] + 5.0])
+    return x, y + rng.standard_normal(y.shape) * [20.0, 0.0002]
+
+
+def network(error="likelihood", **options):
+    return StochasticNetwork({"p": 2, "q": 1}, {"u": 1, "v": 1}, hidden=(16, 16), error=error, **options)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    """A network of each error model, fitted."""
+    networks = {error: network(error) for error in ERRORS}
+    for one in networks.values():
+        one.fit(*samples())
+    return networks
+
+
+def graph_of(model, p=None, q=None):
+    """A graph in which the network reads p and q and writes u and v."""
+    slots = {"p": sg.State(2), "q": sg.State(), "u": sg.State(), "v": sg.State()}
+    graph = sg.Graph(slots, start="before")
+    graph.edge("before", "after", model)
+    graph.reward("after", lambda u, v: u + v)
+    return sg.Objective(sg.unroll(graph))
+
+
+def in_graph(model, mean, covariance=None):
+    """Mean (2,) and covariances (2,) of u and v as the graph has them."""
+    blocks = (None, None) if covariance is None else (covariance[:2, :2], covariance[2, 2])
+    state = {"p": sg.Gaussian(mean[:2], blocks[0]), "q": sg.Gaussian(mean[2], blocks[1])}
+    after = graph_of(model).outcomes(state)[-1].states
+    return np.array([after["u"].mean, after["v"].mean]), np.array([after["u"].covariance, after["v"].covariance])
+
+
+# Predictions
+
+
+@pytest.mark.parametrize("error", ERRORS)
+def test_prediction_equals_the_graph(fitted, error):
+    for mean in samples(5, seed=1)[0]:
+        y, covariance = fitted[error].predict(mean)
+        graph_mean, graph_variance = in_graph(fitted[error], mean)
+        np.testing.assert_allclose(y, graph_mean, rtol=1e-10)
+        np.testing.assert_allclose(np.diag(covariance), graph_variance, rtol=1e-10)
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("error", ERRORS)
+def test_prediction_of_a_gaussian_equals_the_graph(fitted, error, rule):
+    view = fitted[error].with_propagation(rule)
+    mean = np.array([0.3, 480.0, 0.002])
+    covariance = np.zeros((3, 3))
+    covariance[:2, :2], covariance[2, 2] = [[0.01, 0.5], [0.5, 100.0]], 1e-6
+    y, spread = view.predict(mean, covariance)
+    graph_mean, graph_variance = in_graph(view, mean, covariance)
+    np.testing.assert_allclose(y, graph_mean, rtol=1e-10)
+    np.testing.assert_allclose(np.diag(spread), graph_variance, rtol=1e-10)
+    assert np.linalg.eigvalsh(spread).min() >= -1e-9 * np.abs(spread).max()
+
+
+def test_one_row_or_many(fitted):
+    x = samples(4, seed=2)[0]
+    covariance = np.diag([0.01, 25.0, 1e-6])
+    for given_covariance in (None, covariance, np.array([covariance * k for k in range(1, 5)])):
+        y, spread = fitted["likelihood"].predict(x, given_covariance)
+        assert y.shape == (4, 2)
+        assert spread.shape == (4, 2, 2)
+        for i, row in enumerate(x):
+            one = given_covariance[i] if np.ndim(given_covariance) == 3 else given_covariance
+            y_one, spread_one = fitted["likelihood"].predict(row, one)
+            np.testing.assert_allclose(y_one, y[i], rtol=1e-12)
+            np.testing.assert_allclose(spread_one, spread[i], rtol=1e-12)
+
+
+def test_predicted_spread_of_a_gaussian_is_that_of_draws(fitted):
+    """Law of total variance: cov[y] = cov[f(x)] + E[σ²(x)], over 200,000 draws, whose own error is under 1%."""
+    mean, covariance = np.array([0.1, 500.0, 0.0]), np.diag([0.04, 400.0, 1e-5])
+    draws = np.random.default_rng(0).multivariate_normal(mean, covariance, 200_000)
+    y, spread = fitted["likelihood"].predict(draws)
+    expected = np.cov(y.T) + spread.mean(axis=0)
+    found_mean, found = fitted["likelihood"].predict(mean, covariance)
+    np.testing.assert_allclose(found_mean, y.mean(axis=0), atol=0.03 * np.sqrt(np.diag(expected)).max())
+    np.testing.assert_allclose(np.diag(found), np.diag(expected), rtol=0.1)
+
+
+def test_an_unfitted_network_predicts_finite_numbers_and_says_what_it_lacks():
+    one = network()
+    y, spread = one.predict(np.zeros(3))
+    assert np.isfinite(y).all()
+    assert np.isfinite(spread).all()
+    assert one.lacking == "0 of 3 samples"
+    one.fit(*samples(2))
+    assert one.lacking == "2 of 3 samples"
+    one.fit(*samples(3))
+    assert one.lacking is None
+
+
+# Fitting
+
+
+def test_fit_learns_functions_of_any_size(fitted):
+    x, y = samples(400, seed=3)
+    one = StochasticNetwork({"x": 3}, {"y": 2}, hidden=(50, 50))
+    report = one.fit(x, y)
+    xt, yt = samples(1000, seed=4)
+    rmse = np.sqrt(np.mean((one.predict(xt)[0] - yt) ** 2, axis=0))
+    assert (rmse < 0.15 * yt.std(axis=0)).all()
+    np.testing.assert_allclose(report.rmse, rmse, rtol=0.35)  # held-out errors foretell those on new samples
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 8, 20])
+@pytest.mark.parametrize("error", ERRORS)
+def test_few_samples_give_finite_predictions(count, error):
+    one = network(error)
+    x, y = samples(count)
+    one.fit(x, y)
+    for array in (*one.predict(x), *one.predict(x, np.diag([0.1, 10.0, 1e-4]))):
+        assert np.isfinite(array).all()
+
+
+def test_constant_inputs_and_outputs_are_no_obstacle():
+    rng = np.random.default_rng(0)
+    x = np.column_stack([rng.uniform(0, 1, 30), np.full(30, 7.0)])
+    y = np.column_stack([np.full(30, 3.0), x[:, 0]])
+    one = StochasticNetwork({"x": 2}, {"y": 2}, hidden=(20,))
+    one.fit(x, y)
+    mean, spread = one.predict(x)
+    np.testing.assert_allclose(mean[:, 0], 3.0, atol=1e-3)
+    assert np.isfinite(spread).all()
+    one.fit(np.vstack([x, [[0.5, 8.0]]]), np.vstack([y, [[4.0, 0.5]]]))  # now neither is constant
+    assert np.isfinite(one.predict(x)[0]).all()
+
+
+def test_same_seed_same_weights_and_other_seed_other_weights():
+    fits = []
+    for seed in (1, 1, 2):
+        one = network()
+        one.fit(*samples(), seed=seed)
+        one.fit(*samples(70), seed=seed)
+        fits.append([p.value for p in one.parameters])
+    assert all(np.array_equal(a, b) for a, b in zip(fits[0], fits[1], strict=True))
+    assert not all(np.array_equal(a, b) for a, b in zip(fits[0], fits[2], strict=True))
+
+
+def test_fit_is_warm_until_the_samples_have_grown_by_half():
+    one = network()
+    x, y = samples(60)
+    assert not one.fit(x[:40], y[:40]).warm
+    warm = one.fit(x[:50], y[:50])
+    assert warm.warm
+    assert warm.steps[0] < 100
+    assert not one.fit(x, y).warm
+    assert not one.fit(x[:30], y[:30]).warm  # fewer than at the last fit from scratch
+    assert not one.fit(*samples(30, seed=9)).warm  # as many, but others
+
+
+def test_order_of_the_samples_does_not_leak_what_is_held_out():
+    """A sample stays in its fold wherever it stands, so a warm fit never judges by samples it has learned from."""
+    one = network()
+    x, y = samples(60)
+    one.fit(x, y)
+    learner = one._experience.mean_learner
+    before = learner.folds.assign(x, y)
+    order = np.random.default_rng(0).permutation(60)
+    np.testing.assert_array_equal(learner.folds.assign(x[order], y[order]), before[order])
+
+
+def test_error_model_follows_noise_that_depends_on_the_input():
+    rng = np.random.default_rng(0)
+    x = rng.uniform(0.0, 1.0, (400, 1))
+    y = np.sin(3.0 * x) + (0.02 + 0.3 * x) * rng.standard_normal(x.shape)
+    one = StochasticNetwork({"x": 1}, {"y": 1}, hidden=(50, 50))
+    one.fit(x, y)
+    low, high = np.sqrt(one.predict(np.array([[0.1], [0.9]]))[1][:, 0, 0])
+    assert low == pytest.approx(0.05, rel=0.5)
+    assert high == pytest.approx(0.29, rel=0.35)
+
+
+@pytest.mark.slow
+def test_coverage_on_noisy_samples_in_one_dimension():
+    """68 ± 6 and 95 ± 3% of new samples lie in the intervals, on average over eight data sets of 200 samples."""
+    covered = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+
+        def draw(count, rng=rng):
+            x = rng.uniform(-3.0, 3.0, (count, 1))
+            return x, 1.2 + np.sin(3.0 * x) + 0.2 * rng.standard_normal(x.shape)
+
+        one = StochasticNetwork({"x": 1}, {"y": 1})
+        one.fit(*draw(200), seed=seed)
+        x, y = draw(4000)
+        mean, spread = one.predict(x)
+        z = np.abs(y - mean)[:, 0] / np.sqrt(spread[:, 0, 0])
+        covered.append([np.mean(z < 0.9945), np.mean(z < 1.96)])  # quantiles of the central 68 and 95%
+    shares = np.mean(covered, axis=0)
+    assert abs(shares[0] - 0.68) < 0.06
+    assert abs(shares[1] - 0.95) < 0.03
+
+
+def test_the_papers_error_model_is_overconfident_where_samples_are_few():
+    """Errors on training samples say little about new ones; errors on samples that were left out do."""
+    rng = np.random.default_rng(0)
+    x, xt = rng.uniform(-1.0, 1.0, (100, 4)), rng.uniform(-1.0, 1.0, (2000, 4))
+
+    def function(x):
+        return np.sin(3.0 * x[:, :1] * x[:, 1:2]) + np.abs(x[:, 2:3] - x[:, 3:])
+
+    log_likelihood = {}
+    for error in ("likelihood", "paper"):
+        one = StochasticNetwork({"x": 4}, {"y": 1}, hidden=(100, 100), error=error)
+        one.fit(x, function(x))
+        mean, spread = one.predict(xt)
+        variance = np.maximum(spread[:, 0, 0], 1e-12)
+        errors = (function(xt) - mean)[:, 0]
+        log_likelihood[error] = np.mean(-0.5 * np.log(2 * np.pi * variance) - 0.5 * errors**2 / variance)
+    assert log_likelihood["likelihood"] > log_likelihood["paper"] + 0.1
+
+
+# In a graph
+
+
+def miss(y):
+    return -((y - 1.0) ** 2)
+
+
+@pytest.fixture
+def task():
+    """A network that is steered by an action, between an analytic edge and a reward; uncertain start."""
+    one = StochasticNetwork({"a": 1, "s": 1}, {"y": 1}, hidden=(16, 16), name="F_y")
+    slots = {"a": sg.Action(low=-1.0, high=1.0), "s": sg.State(), "y": sg.State()}
+    graph = sg.Graph(slots, start="before")
+    graph.edge("before", "after", one)
+    graph.reward("after", miss)
+    return one, sg.Objective(sg.unroll(graph))
+
+
+def steered(slope, seed=0):
+    x = np.random.default_rng(seed).uniform(-1.0, 1.0, (80, 2))
+    return x, slope * x[:, :1] + 0.2 * x[:, 1:]
+
+
+STATE = {"s": sg.Gaussian(0.0, sd=0.1)}
+
+
+def test_plans_use_new_weights_and_nothing_is_rebuilt_or_compiled(task, monkeypatch):
+    one, objective = task
+    one.fit(*steered(1.5))
+    first = sg.solve(objective, STATE)
+    assert first.actions["a"] == pytest.approx(1 / 1.5, abs=0.1)
+
+    built = []
+
+    def counted(name, function):
+        def wrapper(*arguments, **options):
+            built.append(name)
+            return function(*arguments, **options)
+
+        return wrapper
+
+    from symgraph import objective as objective_module
+    from symgraph.compile import toolchain
+
+    monkeypatch.setattr(subprocess, "run", counted("compiler", subprocess.run))
+    monkeypatch.setattr(toolchain, "load", counted("load", toolchain.load))
+    for name in ("expected_value", "make_kernel", "FlatFunction"):
+        monkeypatch.setattr(objective_module, name, counted(name, getattr(objective_module, name)))
+    monkeypatch.setattr(ca.Function, "__init__", counted("Function", ca.Function.__init__))
+    one.fit(*steered(-2.0))
+    second = sg.solve(objective, STATE)
+    assert second.actions["a"] == pytest.approx(-0.5, abs=0.1)
+    assert not built
+
+
+def test_gradient_is_that_of_finite_differences(task):
+    one, objective = task
+    one.fit(*steered(1.5))
+    for a in (-0.7, 0.2, 0.9):
+        step = 1e-5
+        ahead, behind = (objective.value(STATE, {"a": a + h}) for h in (step, -step))
+        assert objective.gradient(STATE, {"a": a})["a"] == pytest.approx(
+            (ahead - behind) / (2 * step), rel=1e-5, abs=1e-6
+        )
+
+
+def test_hessian_is_that_of_finite_differences(task):
+    one, objective = task
+    one.fit(*steered(1.5))
+    step = 1e-6  # the error network has kinks, and none lies that near
+    ahead, behind = (objective.gradient(STATE, {"a": 0.2 + h})["a"] for h in (step, -step))
+    assert objective.hessian(STATE, {"a": 0.2})[0, 0] == pytest.approx(
+        (ahead - behind) / (2 * step), rel=1e-3, abs=1e-3
+    )
+
+
+def test_compiled_and_interpreted_agree(task):
+    one, objective = task
+    one.fit(*steered(1.5))
+    points = np.linspace(-1.0, 1.0, 7)[None]
+    compiled = objective.evaluate(STATE, points)
+    interpreted = sg.Objective(objective.tree, compiled=False).evaluate(STATE, points)
+    for a, b in zip(compiled, interpreted, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12)
+
+
+def test_model_takes_the_rule_of_a_network(fitted):
+    assert sg.Model(fitted["none"], propagation="full").function.propagation == "full"
+    assert fitted["none"].propagation == "auto"
+    with pytest.raises(sg.GraphError, match=r"'network'.*'ful' is none of its options; did you mean 'full'\?"):
+        sg.Model(fitted["none"], propagation="ful")
+
+
+def test_rename_reads_and_writes(fitted):
+    slots = {"hand": sg.State(2), "q": sg.State(), "u": sg.State(), "depth": sg.State()}
+    graph = sg.Graph(slots, start="before")
+    graph.edge("before", "after", sg.Model(fitted["none"], rename={"p": "hand", "v": "depth"}))
+    graph.reward("after", lambda u, depth: u + depth)
+    x = samples(1)[0][0]
+    value = sg.Objective(sg.unroll(graph)).value({"hand": x[:2], "q": x[2]})
+    assert value == pytest.approx(fitted["none"].predict(x)[0].sum(), rel=1e-10)
+
+
+def test_views_share_the_weights_and_the_samples():
+    one = network()
+    view = one.with_propagation("diagonal")
+    one.fit(*samples(10))
+    assert view.samples == 10
+    np.testing.assert_array_equal(view.predict(np.zeros(3))[0], one.predict(np.zeros(3))[0])
+
+
+def test_pickled_network_predicts_and_plans_the_same(task):
+    one, objective = task
+    one.fit(*steered(1.5))
+    copied_network, copied_objective = pickle.loads(pickle.dumps((one, objective)))
+    x = steered(1.0)[0][:5]
+    np.testing.assert_array_equal(copied_network.predict(x)[0], one.predict(x)[0])
+    assert copied_objective.value(STATE, {"a": 0.3}) == pytest.approx(objective.value(STATE, {"a": 0.3}), rel=1e-12)
+
+
+def test_predicting_needs_no_torch():
+    code = (
+        "import sys; sys.modules['torch'] = None\n"
+        "import numpy as np, symgraph as sg\n"
+        "n = sg.learned.StochasticNetwork({'x': 1}, {'y': 1}, hidden=(4,))\n"
+        "n.predict(np.zeros(1), np.eye(1))\n"
+        "try:\n    n.fit(np.zeros((3, 1)), np.zeros((3, 1)))\n"
+        "except sg.MissingExtraError as error:\n    print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "pip install 'symgraph[learned]'" in done.stdout
+
+
+# Refusals
+
+X, Y = samples(4)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: StochasticNetwork({}, {"y": 1}), ["network: reads", "{label: number of elements}"]),
+        (lambda: StochasticNetwork({"x": 0}, {"y": 1}), ["size of 'x' is 0", "positive whole number"]),
+        (lambda: StochasticNetwork({"x": 1}, {"y": 1.5}), ["size of 'y' is 1.5"]),
+        (lambda: StochasticNetwork({"x": 1}, {3: 1}), ["label 3 is not a name"]),
+        (lambda: StochasticNetwork({"x": 1}, {"y": 1}, hidden=200), ["hidden = 200", "(200, 200)"]),
+        (lambda: StochasticNetwork({"x": 1}, {"y": 1}, hidden=(5, -1)), ["hidden[1] is -1"]),
+        (
+            lambda: StochasticNetwork({"x": 1}, {"y": 1}, propagation="diagnal"),
+            ["'diagnal'", "did you mean 'diagonal'?"],
+        ),
+        (
+            lambda: StochasticNetwork({"x": 1}, {"y": 1}, error="mle"),
+            ["error = 'mle'", "'likelihood', 'paper', 'none'"],
+        ),
+        (lambda: StochasticNetwork({"x": 1}, {"y": 1}, samples_needed=0), ["samples_needed is 0"]),
+        (lambda: network(name="F").fit(X[:, :2], Y), ["F: x has shape (4, 2); give (N, 3)"]),
+        (lambda: network(name="F").fit(X, Y[:3]), ["F: x has 4 rows, y 3"]),
+        (lambda: network().fit(X * np.nan, Y), ["x[0] = [nan, nan, nan] is not finite; leave such samples out"]),
+        (lambda: network().fit(X[:0], Y[:0]), ["x has shape (0, 3)"]),
+        (lambda: network().fit("abc", Y), ["network: x = 'abc' is not a number"]),
+        (lambda: network().predict(np.zeros(2)), ["mean has shape (1, 2); give (N, 3)"]),
+        (lambda: network().predict(np.zeros(3), np.eye(2)), ["covariance has shape (2, 2); give (3, 3)"]),
+        (lambda: network().predict(np.zeros((5, 3)), np.zeros((4, 3, 3))), ["(3, 3) or (5, 3, 3)"]),
+    ],
+)
+def test_refusals_name_place_value_and_remedy(make, words):
+    with pytest.raises(sg.SymgraphError) as caught:
+        make()
+    for word in words:
+        assert word in str(caught.value)
+
+
+@settings(max_examples=25)
+@given(
+    n=st.integers(1, 3),
+    m=st.integers(1, 2),
+    count=st.integers(1, 12),
+    scale=st.sampled_from([1e-9, 1.0, 1e9]),
+    seed=st.integers(0, 99),
+)
+def test_any_finite_samples_give_finite_predictions(n, m, count, scale, seed):
+    rng = np.random.default_rng(seed)
+    x, y = scale * rng.standard_normal((count, n)).round(1), scale * rng.standard_normal((count, m)).round(1)
+    one = StochasticNetwork({"x": n}, {"y": m}, hidden=(5,))
+    one.fit(x, y)
+    for array in (*one.predict(x), *one.predict(x, scale**2 * 0.1 * np.eye(n))):
+        assert np.isfinite(array).all()
