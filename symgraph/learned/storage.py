@@ -40,6 +40,8 @@ DTYPES: dict[str, np.dtype[Any]] = {"F64": np.dtype(np.float64), "F32": np.dtype
 def write(path: str | os.PathLike[str], kind: str, document: Mapping[str, Any], arrays: Mapping[str, Any]) -> None:
     """Write a file, or replace one: whatever interrupts it, the old file stays whole.
 
+    What kills the process may leave a .symgraph-….part beside it, which nobody needs.
+
     Args:
         path: of the file.
         kind: of the model.
