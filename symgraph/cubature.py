@@ -57,10 +57,10 @@ def on_axes(directions: int) -> Rule:
 
 @cache
 def unscented(directions: int) -> Rule:
-    """Return the middle and 2d points at ±√(d + κ) on the axes, with κ = max(0, 3 - d): exact to degree 3.
+    """Return 2d points at ±√(d + κ) on the axes and, where κ = max(0, 3 - d) > 0, the middle: exact to degree 3.
 
     Up to three directions the fourth moment along each axis is right too; beyond, κ = 3 - d would make the weight of
-    the middle negative.
+    the middle negative. For d = 3 its weight is zero, and it is left out.
 
     Source: Julier & Uhlmann, Unscented Filtering and Nonlinear Estimation, Proceedings of the IEEE 92, 2004.
     """
@@ -81,9 +81,10 @@ def _tensor(nodes: Array, weights: Array, directions: int) -> Rule:
 def square_root(covariance: Any) -> Any:
     """Return a lower triangular L (n, n) with LLᵀ = Σ, for a covariance (n, n) of SX or MX.
 
-    Cholesky's pivots are kept above 1e-16 of the trace. Without that, the slope of the square root would be infinite
-    where a variance is zero or a correlation ±1, and gradients NaN; with it, such a direction is spread by 1e-8 of
-    the largest standard deviation, which vanishes in rounding.
+    To the diagonal are added 1e-14 of each variance and 1e-18 of the trace, which vanishes in rounding. Without that,
+    the slope of the square root would be infinite where a variance is zero or a correlation ±1, and gradients NaN; and
+    where the rank is lower than n, rounding would be divided by rounding and grow from column to column. Where Σ = 0
+    the slopes are 0. Of a matrix that is not quite a covariance, the variances are kept.
     """
     n = covariance.shape[0]
     if n == 1:
@@ -98,12 +99,19 @@ _TINY = 1e-200
 @cache
 def _square_root(n: int) -> ca.Function:
     sigma = ca.SX.sym("sigma", n, n)
-    least = 1e-16 * ca.trace(sigma) + _TINY
+    trace = ca.trace(sigma)
+    anything = trace > _TINY  # 0 or 1, without a slope
+    left = [sigma[i, i] for i in range(n)]  # of the variances, by the columns so far
+
+    def deviation(i: int) -> ca.SX:
+        return ca.sqrt(ca.fmax(ca.fmax(left[i], 0.0) + 1e-14 * sigma[i, i] + 1e-18 * trace, _TINY))
+
     factor = ca.SX(n, n)
     for j in range(n):
-        pivot = sigma[j, j] - sum((factor[j, k] ** 2 for k in range(j)), ca.SX(0))
-        factor[j, j] = ca.sqrt(ca.fmax(pivot, least))
+        factor[j, j] = deviation(j)
         for i in range(j + 1, n):
             inner = sum((factor[i, k] * factor[j, k] for k in range(j)), ca.SX(0))
-            factor[i, j] = (sigma[i, j] - inner) / factor[j, j]
+            most = deviation(i)
+            factor[i, j] = ca.fmin(ca.fmax(anything * (sigma[i, j] - inner) / factor[j, j], -most), most)
+            left[i] -= factor[i, j] ** 2
     return ca.Function(f"square_root_{n}", [sigma], [factor])

@@ -46,7 +46,10 @@ def second_order(y: Any, x: Mapping[str, Any], covariance: Mapping[str, Any]) ->
 
 
 def unscented(y: Any, x: Mapping[str, Any], covariance: Mapping[str, Any]) -> Moments:
-    """Average over 2d + 1 points on the axes of Σ: exact for polynomials of degree 3 (Julier & Uhlmann 2004)."""
+    """Average over points on the axes of Σ, two each, and the middle up to d = 2: means are exact to degree 3.
+
+    Source: Julier & Uhlmann, Unscented Filtering and Nonlinear Estimation, Proceedings of the IEEE 92, 2004.
+    """
     return _over_points(y, x, covariance, cubature.unscented(_directions(covariance)) if covariance else None)
 
 

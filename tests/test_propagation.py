@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_tasks import assert_close
+from scipy import stats
+from small_tasks import assert_close, refuses
 
+import symgraph as sg
 from symgraph.propagation import RULES
 
 
@@ -103,3 +105,194 @@ def test_small_variances_agree_with_sampling(rule):
     curvature = 0 if rule == "second-order" else 0.5 * np.exp(m) * s
     assert abs(mean[0] + curvature - samples.mean()) < 3 * samples.std() / 1e3 + s**2
     assert covariance[0, 0] == pytest.approx(samples.var(), rel=0.01)
+
+
+# Rules of points
+
+
+def normal_moments(m, v, most):
+    """E[x^k], k = 0 … most, of N(m, v): E[x^k] = m E[x^(k-1)] + (k - 1) v E[x^(k-2)]."""
+    found = [1.0, m]
+    for k in range(2, most + 1):
+        found.append(m * found[-1] + (k - 1) * v * found[-2])
+    return np.array(found[: most + 1])
+
+
+def linear_form(a, m, s):
+    return a @ m, a @ s @ a
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_unscented_means_of_cubics_are_exact(seed):
+    """Sums of (a'x)^k span the polynomials of degree k, and a'x is a Gaussian; two slots, five directions."""
+    rng = np.random.default_rng(seed)
+    sizes = {"x": 3, "z": 2}
+    slots = {label: (rng.normal(size=n), random_covariance(rng, n)) for label, n in sizes.items()}
+    m, s = np.concatenate([m for m, _ in slots.values()]), np.zeros((5, 5))
+    s[:3, :3], s[3:, 3:] = slots["x"][1], slots["z"][1]
+    forms, powers = rng.normal(size=(8, 5)), rng.integers(0, 4, size=8)
+    for kind in (ca.SX, ca.MX):
+        mean, _ = moments(
+            "unscented",
+            lambda x, z: sum(
+                (ca.mtimes(ca.DM(a).T, ca.vertcat(x, z)) ** k for a, k in zip(forms, powers, strict=True)), 0
+            ),
+            slots,
+            kind,
+        )
+        terms = [normal_moments(*linear_form(a, m, s), 3)[k] for a, k in zip(forms, powers, strict=True)]
+        assert abs(mean[0] - sum(terms)) <= 1e-12 * (
+            1 + np.abs(forms).max() ** 3 * (np.abs(m).max() + np.trace(s)) ** 3
+        )
+
+
+@pytest.mark.parametrize(("directions", "degree"), [(1, 17), (2, 9), (3, 9)])
+@settings(max_examples=20)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_quadrature_is_exact_to_its_degree(directions, degree, seed):
+    """(a'x)^k, whose mean is of degree k and whose variance is of degree 2k; rounding relative to the sum of sizes."""
+    rng = np.random.default_rng(seed)
+    m, s, a = rng.normal(size=directions), random_covariance(rng, directions), rng.normal(size=directions)
+    exact = normal_moments(*linear_form(a, m, s), 2 * degree)
+    sizes = normal_moments(abs(a @ m), a @ s @ a, 2 * degree)
+    for k in (1, 2, degree // 2, degree):
+        mean, covariance = moments("quadrature", lambda x, k=k: ca.mtimes(ca.DM(a).T, x) ** k, {"x": (m, s)})
+        assert abs(mean[0] - exact[k]) <= 1e-12 * sizes[k]
+        if 2 * k <= degree:
+            assert abs(covariance[0, 0] - (exact[2 * k] - exact[k] ** 2)) <= 1e-12 * sizes[2 * k]
+
+
+@pytest.mark.parametrize("rule", ["unscented", "quadrature"])
+@settings(max_examples=20)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_rules_of_points_are_exact_for_affine_functions_of_several_slots(rule, seed):
+    """One of the slots is exact: it moves no point."""
+    rng = np.random.default_rng(seed)
+    a, b, c = rng.normal(size=(3, 2)), rng.normal(size=(3, 2)), rng.normal(size=(3, 1))
+    m, k, h, s, v = rng.normal(size=2), rng.normal(size=2), rng.normal(), random_covariance(rng, 2), 0.7
+    mean, covariance = moments(
+        rule, lambda x, z, w: ca.DM(a) @ x + ca.DM(b) @ z + ca.DM(c) * w, {"x": (m, s), "z": (k, None), "w": (h, v)}
+    )
+    assert_close(mean, a @ m + b @ k + c[:, 0] * h)
+    assert_close(covariance, a @ s @ a.T + v * c @ c.T)
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_unscented_over_a_covariance_without_full_rank(seed):
+    """Six elements that two numbers decide, as a model with more outputs than inputs leaves them.
+
+    To the 1e-14 that the square root adds to each variance.
+    """
+    rng = np.random.default_rng(seed)
+    a, root, m = rng.normal(size=(2, 6)), rng.normal(size=(6, 2)), rng.normal(size=6)
+    s = root @ root.T
+    mean, covariance = moments("unscented", lambda x: ca.DM(a) @ x, {"x": (m, s)})
+    assert_close(mean, a @ m)
+    assert_close(covariance, a @ s @ a.T, 1e-12)
+
+
+@pytest.mark.parametrize("rule", ["unscented", "quadrature"])
+def test_products_of_independent_slots(rule):
+    """E[xz] = mk, var[xz] = m²t + k²s + st: of degree 4 across slots, which points on the axes do not see."""
+    mean, covariance = moments(rule, lambda x, z: x * z, {"x": (2.0, 0.5), "z": (3.0, 0.1)})
+    assert_close(mean, 6.0)
+    assert_close(covariance, 9 * 0.5 + 4 * 0.1 + (0.05 if rule == "quadrature" else 0))
+
+
+@pytest.mark.parametrize("m", np.linspace(-2, 2, 9))
+@pytest.mark.parametrize("sd", [0.01, 1.0])
+def test_quadrature_of_a_kink(m, sd):
+    """E|x| = s√(2/π) exp(-m²/2s²) + m(1 - 2Φ(-m/s)), to a tenth of s.
+
+    The kink is off by twice the integral, up to it, of the difference between the distribution functions, which
+    changes its sign in every gap: half a gap (1.02) times half a weight (0.41), and less when the signs cancel.
+    """
+    mean, _ = moments("quadrature", lambda x: ca.fabs(x), {"x": (m * sd, sd**2)})
+    expected = sd * np.sqrt(2 / np.pi) * np.exp(-(m**2) / 2) + m * sd * (1 - 2 * stats.norm.cdf(-m))
+    assert abs(mean[0] - expected) <= 0.1 * sd
+
+
+@pytest.mark.parametrize("m", np.linspace(-3, 3, 13))
+def test_quadrature_of_a_jump(m):
+    """P(x > 0) is off by no more than the weight of one point (Chebyshev, Markov and Stieltjes): 0.41 at most."""
+    mean, covariance = moments("quadrature", lambda x: x > 0, {"x": (m, 1.0)})
+    assert abs(mean[0] - stats.norm.cdf(m)) <= 0.41
+    assert_close(covariance, mean[0] * (1 - mean[0]))
+    assert 0 <= mean[0] <= 1 + 1e-12
+
+
+def test_quadrature_over_many_directions_is_refused():
+    x, z = ca.SX.sym("x", 2), ca.SX.sym("z", 2)
+    sigma = {"x": ca.SX.sym("s", 2, 2), "z": ca.SX.sym("t", 2, 2)}
+    refuses(
+        lambda: RULES["quadrature"](x + z, {"x": x, "z": z}, sigma),
+        sg.GraphError,
+        "'quadrature' over 4 uncertain directions ('x' 2, 'z' 2)",
+        "up to 3",
+        "use 'unscented'",
+    )
+
+
+@pytest.mark.parametrize("rule", ["unscented", "quadrature"])
+def test_functions_that_only_a_call_can_evaluate(rule):
+    """A table between whose points a straight line runs, far from its corners: the mean of an affine function."""
+    table = ca.interpolant("table", "linear", [[-10.0, 0.0, 10.0]], [20.0, 0.0, -20.0])
+    mean, covariance = moments(rule, lambda x: table(x), {"x": (5.0, 0.04)}, ca.MX)
+    assert_close(mean, -10.0)
+    assert_close(covariance, 0.16)
+
+
+# Through an objective
+
+
+def chain(rule, later):
+    """y = (a₁x₁ + a₂, a₂x₂ + 0.3) of two actions, then a reward of y by the rule."""
+    graph = sg.Graph({"x": sg.State(2), "y": sg.State(2), "a": sg.Action(2, low=-1, high=1)}, start="n")
+    graph.edge("n", "end", lambda x, a: {"y": ca.vertcat(a[0] * x[0] + a[1], a[1] * x[1] + 0.3)})
+    graph.reward("end", sg.Model(later, propagation=rule))
+    return sg.Objective(sg.unroll(graph), compiled=False)
+
+
+STATE = {"x": sg.Gaussian([1.0, -0.5], [[0.3, 0.1], [0.1, 0.2]])}
+
+
+@pytest.mark.parametrize("rule", ["unscented", "quadrature"])
+@pytest.mark.parametrize("a", [[0.5, -0.7], [0.3, 0.4], [-0.9, 0.2]], ids=str)
+def test_gradients_against_central_differences(rule, a):
+    """h = 1e-5: the third derivatives, of order 10, leave 1e-9; the rounding of values 1e-11."""
+    objective = chain(rule, lambda y: ca.sin(2 * y[0]) * ca.exp(0.5 * y[1]))
+    got = objective.gradient(STATE, {"a": a})["a"]
+    ahead, behind = [np.array([objective.value(STATE, {"a": a + h * e}) for e in np.eye(2)]) for h in (1e-5, -1e-5)]
+    assert_close(got, (ahead - behind) / 2e-5, 1e-8)
+
+
+@pytest.mark.parametrize("rule", ["unscented", "quadrature"])
+@pytest.mark.parametrize("zero", [[0.0, 0.0], [0.0, 0.6], [0.6, 0.0]], ids=str)
+def test_gradients_where_actions_drive_a_variance_to_zero(rule, zero):
+    """Finite, and the limit from where it is not zero, to 1e-3: where a standard deviation goes through zero, the
+    square root of the covariance turns, and points on its axes differ from others by terms of the fourth degree.
+
+    With both actions 0 nothing is uncertain, and the gradient is that of the plain function.
+    """
+    objective = chain(rule, lambda y: ca.sin(2 * y[0]) * ca.exp(0.5 * y[1]))
+    got = objective.gradient(STATE, {"a": zero})["a"]
+    near = [objective.gradient(STATE, {"a": np.array(zero) + d * np.array([1, 1])})["a"] for d in (1e-4, -1e-4)]
+    assert_close(got, np.mean(near, axis=0), 1e-3)
+    if not any(zero):
+        y = np.array([0.0, 0.3])
+        slopes = np.array([2 * np.cos(2 * y[0]), 0.5 * np.sin(2 * y[0])]) * np.exp(0.5 * y[1])
+        assert_close(got, [slopes @ [1.0, 0.0], slopes @ [1.0, -0.5]], 1e-9)
+        assert_close(objective.value(STATE, {"a": zero}), 0.0, 1e-9)
+
+
+@pytest.mark.parametrize("rule", ["unscented", "quadrature"])
+def test_gradients_where_a_variance_grows_from_zero(rule):
+    """var[y] = a⁺ has a slope where it begins; the sum over points has none there, and no infinite one either."""
+    slots = {"y": sg.State(2), "a": sg.Action(low=0, high=1)}
+    graph = sg.Graph(slots, start="n")
+    graph.reward("n", sg.Model(lambda y, a: ca.exp(a * y[0] + y[1]), propagation=rule))
+    objective = sg.Objective(sg.unroll(graph), compiled=False)
+    got = objective.gradient({"y": sg.Gaussian([0.2, 0.1], np.zeros((2, 2)))}, {"a": 0.5})["a"]
+    assert_close(got, 0.2 * np.exp(0.2), 1e-9)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import enum
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -11,8 +12,9 @@ import typer
 
 from sims.pouring.actions import ACTIONS, SKILLS
 from sims.pouring.episode import fixed_policy, run_episode
+from sims.pouring.geometry import MOUTH_RANGE
 from sims.pouring.materials import MATERIALS
-from sims.pouring.rendering import Camera, film, strip, viewer, write_picture, write_video
+from sims.pouring.rendering import VIDEO_ENDINGS, Camera, Window, film, strip, viewer, write_picture, write_video
 from sims.pouring.world import PouringWorld
 
 MaterialName = enum.StrEnum("MaterialName", list(MATERIALS))
@@ -23,17 +25,21 @@ STILL_STEPS = 20  # the same where only a strip is asked for, since drawing take
 
 def main(
     material: MaterialName = MaterialName.bnc,
-    mouth: float = 0.23,
+    mouth: Annotated[float, typer.Option(min=MOUTH_RANGE[0], max=MOUTH_RANGE[1])] = 0.23,
     skill: Skill = Skill.tip,
     seed: int = 0,
-    trials: Annotated[int, typer.Option(help="Attempts after which to stop.")] = 1,
+    trials: Annotated[int, typer.Option(min=1, help="Attempts after which to stop.")] = 1,
     pour_x: Annotated[float, typer.Option(help="Shoulder from the receiver's centre.")] = -0.2,
     pour_z: Annotated[float, typer.Option(help="Shoulder above the floor.")] = 0.33,
     pictures: Annotated[Path | None, typer.Option(help="Where to write a strip of stills.")] = None,
     video: Annotated[Path | None, typer.Option(help="Where to write an .mp4 or .gif.")] = None,
-    view: Annotated[bool, typer.Option(help="Watch it in MuJoCo's viewer; needs a screen.")] = False,
+    view: Annotated[
+        bool, typer.Option(help="Watch it in MuJoCo's viewer until that is closed; needs a screen.")
+    ] = False,
 ) -> None:
     """Pour once or a few times with middling parameters."""
+    if video and video.suffix not in VIDEO_ENDINGS:  # said now, not after the episode
+        raise typer.BadParameter(f"--video: {str(video)!r} does not end in one of {list(VIDEO_ENDINGS)}")
     world = PouringWorld(str(material), mouth)
     actions = {label: bounds.scale(0.4) for label, bounds in ACTIONS.items()}
     actions |= {"pour_position": (pour_x, pour_z), "shake_stroke": (0.06, -1.57)}
@@ -41,25 +47,30 @@ def main(
     camera = Camera(world)
     with contextlib.ExitStack() as stack:
         frames: list = []
+        windows: list[Window] = []
 
         def begin(world: PouringWorld) -> None:
             nonlocal frames
             if view:
-                stack.enter_context(viewer(world))
+                windows.append(stack.enter_context(viewer(world)))
             if pictures or video:
                 frames = stack.enter_context(film(world, camera, FRAME_STEPS if video else STILL_STEPS))
 
         episode = run_episode(world, policy, seed, trials, begin)
-    camera.close()
-    if pictures:
-        write_picture(pictures, strip(frames))
-    if video:
-        write_video(video, frames, fps=20)
-    for stop in episode.stops:
-        typer.echo(f"trial stopped: {stop}")
-    typer.echo(f"episode: {episode.end.value if episode.end else 'left after the last trial'}")
-    for name, value in episode.metrics.items():
-        typer.echo(f"{name}: {value:g}")
+        camera.close()
+        if pictures:
+            write_picture(pictures, strip(frames))
+        if video:
+            write_video(video, frames, fps=20)
+        for stop in episode.stops:
+            typer.echo(f"trial stopped: {stop}")
+        typer.echo(f"episode: {episode.end.value if episode.end else 'left after the last trial'}")
+        for clamp in episode.clamps:
+            typer.echo(f"clamped {clamp.label}: {clamp.asked} to {clamp.used}")
+        for name, value in episode.metrics.items():
+            typer.echo(f"{name}: {value:g}")
+        while any(window.is_running() for window in windows):  # the end is worth a look
+            time.sleep(0.1)
 
 
 if __name__ == "__main__":

@@ -28,9 +28,9 @@ class Attraction:
     def __init__(self, material: Material, count: int) -> None:
         self._k = material.attraction / _REFERENCE_MASS
         self._reach = material.reach**2
-        self._squares = np.empty((count, count))
+        self._ways = np.empty((3, count, count))
+        self._squares = np.empty((3, count, count))
         self._near = np.empty((count, count), dtype=bool)
-        self._diagonal = np.diag_indices(count)
 
     @property
     def active(self) -> bool:
@@ -39,16 +39,17 @@ class Attraction:
 
     def accelerations(self, positions: np.ndarray) -> np.ndarray:
         """Return the (n, 3) accelerations [length / time^2] of spheres at (n, 3) positions [length]."""
-        weights = self._squares
-        centred = positions - positions.mean(axis=0)  # keeps the differences below accurate
-        norms = np.einsum("ij,ij->i", centred, centred)
-        np.matmul(centred, centred.T, out=weights)
-        weights *= -2.0
-        weights += norms
-        weights += norms[:, None]
+        # Element by element and row after row, without matrix products: these are rounded differently on
+        # other processors, and a jam that breaks or holds by the last digit would be another one there.
+        axes = positions.T
+        np.subtract(axes[:, :, None], axes[:, None, :], out=self._ways)  # [axis, j, i] from i to j
+        np.square(self._ways, out=self._squares)
+        weights = self._squares[0]
+        weights += self._squares[1]
+        weights += self._squares[2]
         np.less(weights, self._reach, out=self._near)
         np.maximum(weights, _CLOSEST, out=weights)
         np.divide(self._k, weights, out=weights)
         weights *= self._near
-        weights[self._diagonal] = 0.0
-        return weights @ centred - weights.sum(axis=1)[:, None] * centred
+        self._ways *= weights
+        return self._ways.sum(axis=1).T

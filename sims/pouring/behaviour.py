@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sims.pouring.census import Census
+from sims.pouring.census import Census, SphereClass
 from sims.pouring.geometry import GRIP_RANGE
 from sims.pouring.scene import CONTROL_STEP
 from sims.pouring.simulation import Simulation, SimulationState
@@ -241,7 +241,7 @@ class Behaviour:
         return "spilled" if self.census.spilled - self.trial.spilled >= SPILLS else None
 
     def _calm(self) -> bool:
-        outside = self.census.classes != 0
+        outside = self.census.classes != SphereClass.SOURCE
         return not (outside & (np.linalg.norm(self.simulation.velocities, axis=1) > CALM_SPEED)).any()
 
     def save(self) -> BehaviourState:

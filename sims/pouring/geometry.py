@@ -122,7 +122,7 @@ class Receiver:
         ValueError: A size lies outside its range.
     """
 
-    size: tuple[float, float, float] = RECEIVER_SIZE
+    size: tuple[float, ...] = RECEIVER_SIZE
 
     def __post_init__(self) -> None:
         if len(self.size) != 3 or not all(0.1 <= side <= 1.0 for side in self.size):

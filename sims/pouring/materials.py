@@ -16,7 +16,7 @@ class Material:
     no such speed, and friction, which here separates the same materials, stands in its place.
 
     Args:
-        bounce: Speed after a collision divided by the speed before it, in [0.05, 0.9].
+        bounce: Speed after a collision divided by the speed before it, in [0.05, 0.7].
         friction: Coulomb friction coefficient of all contacts of the spheres, in [0.001, 2].
         attraction: Constant K between spheres of density 1 [length^4 / time^2], in [0, 1e-5].
         reach: Distance up to which spheres attract each other [length], in [0.05, 0.5].
@@ -45,11 +45,12 @@ class Material:
         return np.array([self.bounce, self.friction, 1e6 * self.attraction, self.reach])
 
 
-_RANGES = {"bounce": (0.05, 0.9), "friction": (0.001, 2.0), "attraction": (0.0, 1e-5), "reach": (0.05, 0.5)}
+# Contacts that give back more would let a fast sphere through a wall.
+_RANGES = {"bounce": (0.05, 0.7), "friction": (0.001, 2.0), "attraction": (0.0, 1e-5), "reach": (0.05, 0.5)}
 
-# Bounce, attraction and reach are those of the published simulator. Its friction of 0.001 lets nothing jam in
-# MuJoCo, where contacts do not stick as its softer ones do: 0.35 makes viscous material jam at a mouth of
-# 0.13.
+# Bounce, attraction and reach are those of the published simulator. With its friction of 0.001 viscous material
+# often pours through a mouth of 0.13 in MuJoCo, where contacts do not stick as its softer ones do; 0.35 makes it
+# jam reliably.
 MATERIALS = {
     "wat": Material(bounce=0.1, friction=0.1, attraction=0.0, reach=0.1),
     "bnc": Material(bounce=0.7, friction=0.1, attraction=0.0, reach=0.1),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Protocol
 
 import imageio.v3 as imageio
 import mujoco
@@ -19,6 +21,7 @@ from sims.pouring.scene import CONTROL_STEP
 from sims.pouring.simulation import Simulation
 from sims.pouring.world import PouringWorld
 
+VIDEO_ENDINGS = (".mp4", ".gif")
 COLOURS = {
     SphereClass.SOURCE: (0.20, 0.45, 0.95, 1.0),
     SphereClass.FLOWING: (1.00, 0.75, 0.05, 1.0),
@@ -26,6 +29,13 @@ COLOURS = {
     SphereClass.SPILLED: (0.90, 0.10, 0.10, 1.0),
     SphereClass.BOUNCED: (0.55, 0.35, 0.75, 1.0),
 }
+
+
+class Window(Protocol):
+    """What a viewer's window can be asked."""
+
+    def is_running(self) -> bool:
+        """Whether nobody has closed it."""
 
 
 class Camera:
@@ -51,8 +61,7 @@ class Camera:
         mujoco.mj_kinematics(simulation.model, data)
         mujoco.mj_camlight(simulation.model, data)
         view = mujoco.MjvCamera()
-        view.lookat[:] = [float(simulation.receiver_pose[0]) - 0.2, 0.0, 0.36]
-        view.distance, view.azimuth, view.elevation = 1.75, 90.0, -10.0
+        aim(view, simulation)
         renderer.update_scene(data, camera=view)
         paint(renderer.scene, simulation.model, self._world.behaviour.census.classes)
         return renderer.render().copy()
@@ -70,6 +79,12 @@ class Camera:
         if self._renderer is not None:
             self._renderer.close()
         self._renderer = self._data = None
+
+
+def aim(view: mujoco.MjvCamera, simulation: Simulation) -> None:
+    """Look from the side at the receiver and the place where the source pours."""
+    view.lookat[:] = [float(simulation.receiver_pose[0]) - 0.2, 0.0, 0.36]
+    view.distance, view.azimuth, view.elevation = 1.75, 90.0, -10.0
 
 
 def paint(scene: mujoco.MjvScene, model: mujoco.MjModel, classes: np.ndarray) -> None:
@@ -138,12 +153,14 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> N
 
 
 @contextmanager
-def viewer(world: PouringWorld, speed: float = 1.0) -> Iterator[None]:
+def viewer(world: PouringWorld) -> Iterator[Window]:
     """Show the world in MuJoCo's interactive viewer while the block runs; this needs a screen.
+
+    One unit of simulated time takes a second while the window is open. Closing it lets the block run on
+    unseen. The viewer draws copies, so that its buttons and the mouse disturb nothing.
 
     Args:
         world: Whose present episode is shown; reset it before.
-        speed: Simulated time per second.
 
     Raises:
         RuntimeError: There is no screen.
@@ -154,14 +171,27 @@ def viewer(world: PouringWorld, speed: float = 1.0) -> Iterator[None]:
     import mujoco.viewer  # it needs a screen already when it is imported
 
     simulation = world.behaviour.simulation
-    with mujoco.viewer.launch_passive(simulation.model, simulation.data) as window:
+    model = copy.copy(simulation.model)
+    data = mujoco.MjData(model)
+    with mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False) as window:
+        aim(window.cam, simulation)
+        shown = time.perf_counter()
 
         def show(simulation: Simulation) -> None:
+            nonlocal shown
+            if not window.is_running():
+                return
+            with window.lock():
+                data.qpos[:] = simulation.data.qpos
+                model.geom_rgba[-SPHERES:] = [COLOURS[SphereClass(one)] for one in world.behaviour.census.classes]
+                mujoco.mj_kinematics(model, data)
             window.sync()
-            time.sleep(CONTROL_STEP / speed)
+            time.sleep(max(0.0, shown + CONTROL_STEP - time.perf_counter()))
+            shown = time.perf_counter()
 
+        show(simulation)
         simulation.listeners.append(show)
         try:
-            yield
+            yield window
         finally:
             simulation.listeners.remove(show)

@@ -75,7 +75,7 @@ class PouringWorld:
         mouth: float | tuple[float, float] = 0.23,
         target: float | tuple[float, float] = 0.3,
         receiver_x: float | tuple[float, float] = RECEIVER_RANGE,
-        receiver_size: tuple[float, float, float] = RECEIVER_SIZE,
+        receiver_size: Sequence[float] = RECEIVER_SIZE,
         time_limit: float = 500.0,
     ) -> None:
         if isinstance(material, str | Material):
@@ -86,7 +86,7 @@ class PouringWorld:
         self._mouth = _check_range("mouth", mouth, MOUTH_RANGE)
         self._target = _check_range("target", target, (0.0, SPHERES * SPHERE_AMOUNT))
         self._receiver_x = _check_range("receiver_x", receiver_x, RECEIVER_RANGE)
-        self._receiver = Receiver(receiver_size)
+        self._receiver = Receiver(tuple(receiver_size))
         self._time_limit = time_limit
         self._behaviour: Behaviour | None = None
         self.clamps: list[Clamp] = []

@@ -186,7 +186,7 @@ class StochasticNetwork(LearnedModel):
             if self.error == "likelihood":
                 steps += (self._fit_error(x[held_out], errors[held_out], scaling, rng, bar),)
             elif self.error == "paper":
-                steps += (self._fit_error(x, np.abs(scaling[1](y - self._mean(x))), scaling, rng, bar),)
+                steps += (self._fit_error(x, np.abs(scaling[1](y) - scaling[1](self._mean(x))), scaling, rng, bar),)
         kept.samples = len(x)
         rmse = np.sqrt(np.mean(errors[held_out] ** 2, axis=0)) * scaling[1].sd
         return FitReport(len(x), schedule.warm, steps, rmse, time.perf_counter() - begin)

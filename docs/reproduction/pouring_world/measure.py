@@ -9,8 +9,9 @@ from __future__ import annotations
 import csv
 import enum
 import hashlib
+import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,7 +19,9 @@ import numpy as np
 import typer
 
 from sims.pouring import ACTIONS, MATERIALS, SKILLS, Material, PouringWorld, SimulationFailed
+from sims.pouring.behaviour import SPHERE_AMOUNT, SPILL_AMOUNT
 from sims.pouring.observation import flow
+from sims.pouring.simulation import Simulation
 
 FOLDER = Path(__file__).parent
 MOUTHS = (0.11, 0.13, 0.17, 0.20, 0.23, 0.25)
@@ -31,6 +34,10 @@ GOOD = {
         "shake_stroke": (0.06, -1.5708),
     },
 }
+SETUPS = {"tip": ("bnc", 0.23), "shake": ("vsc", 0.13)}  # the paper's SETUP1 and SETUP2
+TARGET = 55  # spheres that are more than the target amount 0.3
+CANDIDATES = 40  # random action sets per skill
+ACTION_SET = ("skill", "px", "pz", "tilt_rate", "search_rate", "shake_speed", "shake_length", "shake_angle")
 GIVEN = (
     "label",
     "material",
@@ -65,7 +72,10 @@ MEASURED = (
     "failed",
     "digest",
 )
-COLUMNS = GIVEN + MEASURED
+AT_STOP = ("received_at_stop", "released_at_stop")  # wanted of the best action sets only
+
+
+Actions = dict[str, float | tuple[float, float]]
 
 
 @dataclass(frozen=True)
@@ -77,7 +87,7 @@ class Attempt:
     name: str
     mouth: float
     skill: str
-    actions: dict[str, float | tuple[float, float]]
+    actions: Actions
     seed: int
 
     def columns(self) -> dict[str, object]:
@@ -109,6 +119,15 @@ def perform(attempt: Attempt) -> dict[str, object]:
     world = PouringWorld(attempt.material, attempt.mouth)
     actions = {"grasp_ratio": 0.3, **attempt.actions}
     world.reset(attempt.seed)
+    at_stop: list[int] = []
+
+    def look(simulation: Simulation) -> None:
+        # The census still counts the moment before this step: the first time, that at which the skill stopped.
+        if not at_stop and world.behaviour.trial.stopped is not None:
+            census = world.behaviour.census
+            at_stop.extend([census.in_receiver, len(census.classes) - census.in_source])
+
+    world.behaviour.simulation.listeners.append(look)
     begin = time.process_time()  # settled starts are reused where a learner meets a setup again: not counted
     failed = 0
     try:
@@ -125,6 +144,8 @@ def perform(attempt: Attempt) -> dict[str, object]:
         "spilled": census.spilled,
         "released": len(census.classes) - census.in_source,
         "stop": behaviour.trial.stopped,
+        "received_at_stop": at_stop[0] if at_stop else "",
+        "released_at_stop": at_stop[1] if at_stop else "",
         "skill_time": round(behaviour.trial.duration, 3),
         "simulated_time": round(behaviour.time, 3),
         "cpu": round(cpu, 3),
@@ -181,7 +202,7 @@ def again() -> Iterator[Attempt]:
 def dependence() -> Iterator[Attempt]:
     """One action after the other varied, tipping at SETUP1 and shaking at SETUP2, 10 seeds each."""
     tip, shake = GOOD["tip"], GOOD["shake"]
-    variations: list[tuple[str, dict[str, float | tuple[float, float]]]] = [("tip", tip), ("shake", shake)]
+    variations: list[tuple[str, Actions]] = [("tip", tip), ("shake", shake)]
     variations += [("tip", {**tip, "tilt_rate": rate}) for rate in (0.010, 0.017, 0.020)]
     variations += [("tip", {**tip, "search_rate": rate}) for rate in (0.002, 0.004, 0.005)]
     variations += [("tip", {**tip, "pour_position": (x, 0.33)}) for x in (-0.29, -0.24, -0.14, -0.09)]
@@ -190,44 +211,102 @@ def dependence() -> Iterator[Attempt]:
     variations += [("shake", {**shake, "shake_stroke": (length, -1.5708)}) for length in (0.05, 0.08, 0.10)]
     variations += [("shake", {**shake, "shake_stroke": (0.06, angle)}) for angle in (-0.7854, 0.0, 0.7854, 1.5708)]
     variations += [("shake", {**shake, "pour_position": (x, 0.33)}) for x in (-0.30, -0.25, -0.15, -0.10)]
-    setups = {"tip": ("bnc", 0.23), "shake": ("vsc", 0.13)}
     for seed in range(10):
         for skill, actions in variations:
-            name, mouth = setups[skill]
-            yield Attempt("dependence", MATERIALS[name], name, mouth, skill, actions, seed)
+            yield _at_setup("dependence", skill, actions, seed)
 
 
-def best() -> Iterator[Attempt]:
-    """Random action sets in the useful part of the bounds, tipping at SETUP1 and shaking at SETUP2."""
+def search() -> Iterator[Attempt]:
+    """Random action sets over all that is useful, 2 seeds each."""
     generator = np.random.default_rng(1)
-    candidates: list[tuple[str, dict[str, float | tuple[float, float]]]] = []
-    for _ in range(12):
-        x, z = (
-            round(float(generator.uniform(-0.26, -0.14)), 4),
-            round(float(generator.uniform(0.32, 0.38)), 4),
-        )
-        rates = [round(float(generator.uniform(b.low[0], b.high[0])), 4) for b in _rates()]
-        candidates.append(("tip", {"pour_position": (x, z), "tilt_rate": rates[0], "search_rate": rates[1]}))
-        stroke = generator.uniform(ACTIONS["shake_stroke"].low, ACTIONS["shake_stroke"].high).round(4)
-        candidates.append(
-            (
-                "shake",
-                {
-                    "pour_position": (x, z),
-                    "tilt_rate": rates[0],
-                    "shake_speed": rates[2],
-                    "shake_stroke": tuple(stroke.tolist()),
-                },
-            )
-        )
-    for seed in range(10):
-        for number, (skill, actions) in enumerate(candidates):
-            name, mouth = {"tip": ("bnc", 0.23), "shake": ("vsc", 0.13)}[skill]
-            yield Attempt(f"candidate {number}", MATERIALS[name], name, mouth, skill, actions, seed)
+    ranges = {label: (bounds.low, bounds.high) for label, bounds in ACTIONS.items()}
+    ranges["pour_position"] = ((-0.26, 0.32), (-0.08, 0.45))  # elsewhere much is spilled, see `dependence`
+    candidates = []
+    for _ in range(CANDIDATES):
+        drawn = {label: generator.uniform(*limits).round(4).tolist() for label, limits in ranges.items()}
+        values = {label: tuple(value) if len(value) > 1 else value[0] for label, value in drawn.items()}
+        candidates += [(skill, {label: values[label] for label in GOOD[skill]}) for skill in SKILLS]
+    for seed in range(2):
+        for skill, actions in candidates:
+            yield _at_setup("search", skill, actions, seed)
 
 
-def _rates() -> tuple:
-    return ACTIONS["tilt_rate"], ACTIONS["search_rate"], ACTIONS["shake_speed"]
+def finals() -> Iterator[Attempt]:
+    """The best of the search, 10 seeds each."""
+    yield from _tried("finals", _best(("search",), 6), range(10))
+
+
+def refined() -> Iterator[Attempt]:
+    """Action sets near the best so far, 10 seeds each."""
+    generator = np.random.default_rng(2)
+    near = []
+    for skill, best in _best(("finals", "dependence"), 1):
+        for _ in range(5):
+            actions = {}
+            for label, value in best.items():
+                low, high = np.array(ACTIONS[label].low), np.array(ACTIONS[label].high)
+                moved = value + generator.uniform(-0.15, 0.15, len(low)) * (high - low)
+                drawn = np.clip(moved, low, high).round(4).tolist()
+                actions[label] = tuple(drawn) if len(drawn) > 1 else drawn[0]
+            near.append((skill, actions))
+    yield from _tried("refined", near, range(10))
+
+
+def fresh() -> Iterator[Attempt]:
+    """The best of all that was tried with 10 seeds, on 10 seeds that had no part in choosing them."""
+    yield from _tried("fresh", _best(("finals", "dependence", "refined"), 3), range(100, 110))
+
+
+def _at_setup(label: str, skill: str, actions: Actions, seed: int) -> Attempt:
+    name, mouth = SETUPS[skill]
+    return Attempt(label, MATERIALS[name], name, mouth, skill, actions, seed)
+
+
+def _tried(label: str, sets: Sequence[tuple[str, Actions]], seeds: range) -> Iterator[Attempt]:
+    for skill, actions in sets:
+        for seed in seeds:
+            yield _at_setup(label, skill, actions, seed)
+
+
+def _best(names: tuple[str, ...], count: int) -> list[tuple[str, Actions]]:
+    """The best action sets of each skill in measured files, judged by `keeps`."""
+    groups: dict[tuple[str, ...], list[dict[str, str]]] = {}
+    for file_name in names:
+        with (FOLDER / f"{file_name}.csv").open(newline="") as file:
+            for row in csv.DictReader(file):
+                groups.setdefault(tuple(row[name] for name in ACTION_SET), []).append(row)
+    ranked = sorted(groups, key=lambda key: keeps(groups[key]).cost)
+    return [(skill, _actions(key)) for skill in SKILLS for key in [key for key in ranked if key[0] == skill][:count]]
+
+
+def _actions(key: tuple[str, ...]) -> Actions:
+    """The actions of a row's `ACTION_SET`."""
+    given = {name: float(text) for name, text in zip(ACTION_SET[1:], key[1:], strict=True) if text}
+    values: Actions = given | {"pour_position": (given["px"], given["pz"])}
+    if key[0] == "shake":
+        values["shake_stroke"] = (given["shake_length"], given["shake_angle"])
+    return {name: values[name] for name in GOOD[key[0]]}
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What an action set keeps to in 8 of 10 attempts: its cost, spheres short, over and spilled at most."""
+
+    cost: float
+    short: int
+    over: int
+    spilled: int
+
+
+def keeps(rows: Sequence[Mapping[str, str]]) -> Kept:
+    """Judge the attempts of one action set by the cheapest 80 % under equation (8), in spheres."""
+    received = np.array([float(row["received"]) for row in rows])
+    spilled = np.array([float(row["spilled"]) for row in rows])
+    short, over = np.maximum(0, TARGET - received), np.maximum(0, received - TARGET)
+    amount = SPHERE_AMOUNT
+    cost = 100 * (amount * short) ** 2 + 10 * (SPILL_AMOUNT * spilled) ** 2 + (amount * over) ** 2
+    kept = np.argsort(cost)[: math.ceil(0.8 * len(rows))]
+    return Kept(float(cost[kept].max()), int(short[kept].max()), int(over[kept].max()), int(spilled[kept].max()))
 
 
 def measure(name: str, attempts: Iterator[Attempt]) -> None:
@@ -236,9 +315,10 @@ def measure(name: str, attempts: Iterator[Attempt]) -> None:
     done: list[list[str]] = []
     if path.exists():
         with path.open(newline="") as file:
-            done = [row[: len(COLUMNS) - len(MEASURED)] for row in csv.reader(file)]
+            done = [row[: len(GIVEN)] for row in csv.reader(file)]
     with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS)
+        columns = GIVEN + MEASURED + (AT_STOP if name == "fresh" else ())
+        writer = csv.DictWriter(file, columns, extrasaction="ignore")
         if file.tell() == 0:
             writer.writeheader()
         for attempt in attempts:
@@ -247,7 +327,10 @@ def measure(name: str, attempts: Iterator[Attempt]) -> None:
                 file.flush()
 
 
-EXPERIMENTS = {function.__name__: function for function in (table, jamming, extremes, again, dependence, best)}
+EXPERIMENTS = {
+    function.__name__: function
+    for function in (table, jamming, extremes, again, dependence, search, finals, refined, fresh)
+}
 
 Experiment = enum.StrEnum("Experiment", list(EXPERIMENTS))
 

@@ -46,4 +46,5 @@ if __name__ == "__main__":
         films = {material: pour(material, skill) for material in MATERIALS}
         rows = [strip(frames, 6) for frames in films.values()]
         write_picture(FOLDER / f"strips_{skill}.png", np.concatenate(rows))
-        write_video(FOLDER / f"{skill}_vsc.gif", [frame[::2, ::2] for frame in films["vsc"][::2]], fps=8)
+        if skill == "shake":
+            write_video(FOLDER / "shake_vsc.gif", [frame[::2, ::2] for frame in films["vsc"][::2]], fps=8)

@@ -1,5 +1,8 @@
 """Attraction: the formula, Newton's third law, and what it costs."""
 
+import os
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -38,6 +41,30 @@ def test_two_touching_spheres_pull_with_the_published_share_of_their_weight(name
     positions = np.array([[0.0, 0.0, 0.0], [2 * SPHERE_RADIUS, 0.0, 0.0]])
     pull = Attraction(MATERIALS[name], 2).accelerations(positions)[0, 0]
     assert pull == pytest.approx(share, abs=0.001)  # gravity is 1
+
+
+def test_other_processors_round_it_alike():
+    """BLAS stands for them: it chooses its kernels, and with them the order of its sums, by the processor."""
+    script = """
+import hashlib
+import numpy as np
+from sims.pouring.attraction import Attraction
+from sims.pouring.materials import MATERIALS
+positions = np.random.default_rng(0).uniform(0.0, 0.4, (100, 3))
+accelerations = Attraction(MATERIALS["vsc"], 100).accelerations(positions)
+print(hashlib.sha256(accelerations.tobytes()).hexdigest())
+"""
+    digests = {
+        subprocess.run(
+            [sys.executable, "-c", script],
+            env=os.environ | {"OPENBLAS_CORETYPE": kind},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for kind in ("Nehalem", "Sandybridge")
+    }
+    assert len(digests) == 1
 
 
 def test_materials_without_attraction_need_no_computing():

@@ -1,6 +1,7 @@
 """The command line: an episode, told in words and drawn."""
 
 import imageio.v3 as imageio
+import pytest
 import typer
 from typer.testing import CliRunner
 
@@ -19,7 +20,14 @@ def test_an_episode_is_run_told_and_drawn(tmp_path):
     assert imageio.imread(picture).shape == (480, 6 * 480, 3)
 
 
-def test_a_wrong_material_is_refused():
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [("--material", "oil", "oil"), ("--mouth", "0.3", "0.25"), ("--video", "pour.avi", ".mp4")],
+)
+def test_wrong_values_are_refused_before_anything_runs(option, value, words, monkeypatch):
+    monkeypatch.setattr(command_line, "run_episode", None)
     app = typer.Typer()
     app.command()(command_line.main)
-    assert CliRunner().invoke(app, ["--material", "oil"]).exit_code != 0
+    result = CliRunner().invoke(app, [option, value], env={"COLUMNS": "200"})
+    assert result.exit_code == 2
+    assert words in result.output

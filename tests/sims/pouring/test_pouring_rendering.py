@@ -1,15 +1,18 @@
 """Pictures and videos: they show the classes, disturb nothing and reach the disk."""
 
+import contextlib
 import gc
 import sys
+import types
 
 import imageio.v3 as imageio
+import mujoco
 import numpy as np
 import pytest
 
 from sims.pouring import PouringWorld
 from sims.pouring.census import SphereClass
-from sims.pouring.rendering import Camera, film, strip, viewer, write_picture, write_video
+from sims.pouring.rendering import COLOURS, Camera, film, strip, viewer, write_picture, write_video
 
 
 @pytest.fixture
@@ -71,3 +74,45 @@ def test_a_missing_screen_is_named(world, monkeypatch):
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(RuntimeError, match="there is no screen"), viewer(world):
         pass
+
+
+class FakeWindow:
+    """Stands for MuJoCo's window, which needs a screen: it counts what it shows and closes after 5 pictures."""
+
+    def __init__(self, model, data):
+        self.model, self.data = model, data
+        self.cam = mujoco.MjvCamera()
+        self.synced = 0
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        pass
+
+    def is_running(self):
+        return self.synced < 5
+
+    def lock(self):
+        return contextlib.nullcontext()
+
+    def sync(self):
+        self.synced += 1
+
+
+def test_the_viewer_shows_copies_in_colour_until_it_is_closed(world, monkeypatch):
+    fake = types.SimpleNamespace(launch_passive=lambda model, data, **panels: FakeWindow(model, data))
+    monkeypatch.setitem(sys.modules, "mujoco.viewer", fake)
+    monkeypatch.setattr(mujoco, "viewer", fake, raising=False)
+    monkeypatch.setenv("DISPLAY", ":0")
+    simulation = world.behaviour.simulation
+    world.execute("start", {"grasp_ratio": 0.5})
+    with viewer(world) as window:
+        assert np.array_equal(window.data.qpos, simulation.data.qpos)
+        assert window.data.qpos is not simulation.data.qpos
+        assert (window.model.geom_rgba[-1] == np.float32(COLOURS[SphereClass.SOURCE])).all()
+        assert (simulation.model.geom_rgba[-1] != window.model.geom_rgba[-1]).any()
+        assert window.synced == 1
+        world.execute("grasped", {})
+    assert window.synced == 5
+    assert not simulation.listeners

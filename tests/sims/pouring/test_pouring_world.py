@@ -130,7 +130,7 @@ def test_the_trial_loop_goes_on_where_the_target_is_missed():
 
 
 def test_a_stuck_attempt_ends_early_with_the_same_outcome(monkeypatch):
-    outcomes = []
+    outcomes, durations = [], []
     for speed in (behaviour.REST_SPEED, 0.0):  # at speed 0 nothing ever counts as resting
         monkeypatch.setattr(behaviour, "REST_SPEED", speed)
         world = PouringWorld("vsc+", 0.13, receiver_x=0.7)
@@ -138,7 +138,9 @@ def test_a_stuck_attempt_ends_early_with_the_same_outcome(monkeypatch):
         advance(world, "poured", "tip")
         census = world.behaviour.census
         outcomes.append((census.in_receiver, census.spilled, census.in_source, world.behaviour.trial.stopped))
+        durations.append(world.behaviour.trial.duration)
         monkeypatch.undo()
+    assert durations[0] < durations[1] - 3.0
     assert outcomes[0] == outcomes[1]
     assert outcomes[0][3] == "no flow"
 
