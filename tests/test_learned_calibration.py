@@ -166,7 +166,7 @@ def test_a_network_is_calibrated_on_what_it_has_not_seen():
     network.fit(x[:300], y[:300], progress=False)
     report = calibrate(network, x[300:, 0], y[300:, 0])
     assert report.samples == 100
-    assert report.overall == report.outputs["y"]
+    assert report.overall.log_likelihood == pytest.approx(report.outputs["y"].log_likelihood, rel=1e-12)
     assert 0.5 < report.overall.coverage[0.68] < 0.85
     low, high = (report.sd[side, 0].mean() for side in (x[300:, 0] < 0, x[300:, 0] > 0))
     assert high > 2 * low
