@@ -8,6 +8,7 @@ from symgraph.errors import (
     MissingExtraError,
     SlotError,
     SolveError,
+    StorageError,
     SymgraphError,
 )
 from symgraph.graph import Graph
@@ -40,6 +41,7 @@ __all__ = [
     "SlotError",
     "SolveError",
     "State",
+    "StorageError",
     "SymgraphError",
     "Tree",
     "learned",

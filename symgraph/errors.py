@@ -30,6 +30,10 @@ class CompileError(SymgraphError, RuntimeError):
     """The C compiler refused generated code."""
 
 
+class StorageError(SymgraphError, OSError):
+    """A file that cannot be written or read, is damaged, or holds something else."""
+
+
 class MissingExtraError(SymgraphError, ImportError):
     """An optional dependency is not installed."""
 

@@ -16,6 +16,7 @@ BUILTIN = {
     sg.InputError: ValueError,
     sg.SolveError: RuntimeError,
     sg.CompileError: RuntimeError,
+    sg.StorageError: OSError,
     sg.MissingExtraError: ImportError,
 }
 

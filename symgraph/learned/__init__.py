@@ -1,6 +1,16 @@
 """Learned models: networks that predict how sure they are, fitted to samples and planned with as they are."""
 
 from symgraph.learned.branches import BranchNetwork, BranchReport
+from symgraph.learned.calibration import Calibration, PitHistogram, Scores, calibrate
 from symgraph.learned.network import FitReport, StochasticNetwork
 
-__all__ = ["BranchNetwork", "BranchReport", "FitReport", "StochasticNetwork"]
+__all__ = [
+    "BranchNetwork",
+    "BranchReport",
+    "Calibration",
+    "FitReport",
+    "PitHistogram",
+    "Scores",
+    "StochasticNetwork",
+    "calibrate",
+]

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import copy
+import inspect
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
+import numpy as np
+
+from symgraph.errors import InputError
+from symgraph.learned import snapshot, storage
 from symgraph.learned.gaussians import RULES
 from symgraph.learned.inputs import checked_count, checked_hidden, checked_option, checked_sizes
+from symgraph.learned.learner import Learner, Memory
 from symgraph.model import Parameter
 from symgraph.slots import Gaussian
 
@@ -70,6 +77,74 @@ class LearnedModel(ABC):
         view.propagation = checked_option(rule, RULES, f"{self.name}: propagation")
         return view
 
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write all that predictions and further fits need to one file; a file that is there is replaced as a whole.
+
+        Args:
+            path: of the file, a safetensors file with a JSON document in its metadata; no code is ever loaded from it.
+
+        Raises:
+            StorageError: the file cannot be written.
+            MissingExtraError: safetensors is not installed.
+        """
+        stored = snapshot.Stored(self._settings, self.samples, [p.value for p in self.parameters], self._networks)
+        document, arrays = snapshot.pack(stored, self._layout(self._settings))
+        storage.write(path, type(self).__name__, document, arrays)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Return the model that `save` wrote: it predicts the same, and a fit goes on as if nothing had happened.
+
+        Raises:
+            StorageError: the file cannot be read, is damaged, or holds something else.
+            MissingExtraError: safetensors is not installed.
+        """
+        document, arrays = storage.read(path, cls.__name__, lambda said: snapshot.expected(said, cls._layout_of(said)))
+        try:
+            stored = snapshot.unpack(document, arrays, cls._layout_of(document))
+            model = cls(**stored.settings)
+        except InputError as error:
+            raise storage.damaged(path, str(error)) from None
+        for parameter, value in zip(model.parameters, stored.parameters, strict=True):
+            parameter.value = np.asfortranarray(value)  # the layout that a fit gives them
+        model._resume(stored.samples, stored.networks)
+        return model
+
+    @classmethod
+    def _layout_of(cls, document: storage.Document) -> snapshot.Layout:
+        """Return what the model of a document consists of, without making anything of that size."""
+        settings = snapshot.checked_keys(
+            document.get("settings"), dict(inspect.signature(cls).parameters), "'settings'"
+        )
+        if not isinstance(settings["name"], str):
+            raise InputError(f"name is {settings['name']!r}, and no string")
+        return cls._layout(settings)
+
+    @property
+    @abstractmethod
+    def _settings(self) -> dict[str, Any]:
+        """All arguments that make such a model."""
+
+    @classmethod
+    @abstractmethod
+    def _layout(cls, settings: Mapping[str, Any]) -> snapshot.Layout:
+        """Return what a model of these settings consists of; raise InputError where their sizes make no sense."""
+
+    @property
+    @abstractmethod
+    def _networks(self) -> dict[str, tuple[Learner, Memory | None]]:
+        """What the next fit of each network goes on from."""
+
+    @abstractmethod
+    def _resume(self, samples: int, networks: Mapping[str, tuple[Learner, Memory | None]]) -> None:
+        """Take over what `_networks` was, after a fit to so many samples."""
+
     def __repr__(self) -> str:
         reads, writes = ", ".join(self.reads), ", ".join(self.writes)
         return f"{type(self).__name__}({self.name}: {reads} → {writes}, hidden {self.hidden}, {self.samples} samples)"
+
+
+def layer_sizes(settings: Mapping[str, Any], outputs: int) -> tuple[int, ...]:
+    """Return the sizes of a network's layers, from settings that nobody has checked."""
+    inputs = sum(checked_sizes(settings["reads"], "reads").values())
+    return (inputs, *checked_hidden(settings["hidden"], "hidden"), outputs)

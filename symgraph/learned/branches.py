@@ -13,11 +13,12 @@ import numpy as np
 from symgraph.cubature import gauss_hermite, on_axes, square_root
 from symgraph.errors import InputError, did_you_mean, names
 from symgraph.learned import losses
-from symgraph.learned.base import Experience, LearnedModel
+from symgraph.learned.base import Experience, LearnedModel, layer_sizes
 from symgraph.learned.gaussians import Mixture, at_points, pass_through, splits
 from symgraph.learned.inputs import checked_pair, checked_rows, mean_and_root
 from symgraph.learned.learner import Learner, Memory
 from symgraph.learned.perceptron import Perceptron, Scaling
+from symgraph.learned.snapshot import Layout, layer_shapes
 from symgraph.model import Parameter
 from symgraph.progress import Progress
 from symgraph.slots import Array, Gaussian
@@ -165,6 +166,25 @@ class BranchNetwork(LearnedModel):
         self._logits.set(kept.memory.copies, *scaling)
         kept.samples = len(x)
         return BranchReport(len(x), schedule.warm, trained.steps, trained.loss, time.perf_counter() - begin)
+
+    @property
+    def _settings(self) -> dict[str, Any]:
+        settings = "name", "reads", "hidden", "propagation", "samples_needed"
+        return {name: getattr(self, name) for name in settings} | {"branches": self.writes}
+
+    @classmethod
+    def _layout(cls, settings: Mapping[str, Any]) -> Layout:
+        if not isinstance(settings["branches"], list | tuple):
+            raise InputError(f"branches is {settings['branches']!r}, and no list")
+        sizes = layer_sizes(settings, len(settings["branches"]))
+        return Layout(layer_shapes("logits", sizes), {"logits": (sizes, False)})
+
+    @property
+    def _networks(self) -> dict[str, tuple[Learner, Memory | None]]:
+        return {"logits": (self._experience.learner, self._experience.memory)}
+
+    def _resume(self, samples: int, networks: Mapping[str, tuple[Learner, Memory | None]]) -> None:
+        self._experience = BranchExperience(samples, *networks["logits"])
 
 
 def _expected_softmax(logits: Mixture) -> ca.MX:

@@ -14,11 +14,12 @@ from symgraph.compile.interpreted import FlatFunction
 from symgraph.cubature import gauss_hermite, square_root
 from symgraph.errors import InputError
 from symgraph.learned import losses
-from symgraph.learned.base import Experience, LearnedModel
+from symgraph.learned.base import Experience, LearnedModel, layer_sizes
 from symgraph.learned.gaussians import Mixture, pass_cheaply, pass_through
 from symgraph.learned.inputs import checked_option, checked_pair, checked_rows, checked_sizes, mean_and_root
 from symgraph.learned.learner import Learner, Memory
 from symgraph.learned.perceptron import Perceptron, Scaling
+from symgraph.learned.snapshot import Layout, layer_shapes
 from symgraph.model import Parameter
 from symgraph.progress import Progress
 from symgraph.slots import Array, Gaussian
@@ -242,6 +243,31 @@ class StochasticNetwork(LearnedModel):
             function = ca.Function("predict", symbols, [ca.densify(y), ca.densify(covariance)])
             self._built[self.propagation] = FlatFunction(function)
         return self._built[self.propagation]
+
+    @property
+    def _settings(self) -> dict[str, Any]:
+        settings = "name", "reads", "writes", "hidden", "propagation", "error", "samples_needed"
+        return {name: getattr(self, name) for name in settings}
+
+    @classmethod
+    def _layout(cls, settings: Mapping[str, Any]) -> Layout:
+        sizes = layer_sizes(settings, sum(checked_sizes(settings["writes"], "writes").values()))
+        if settings["error"] == "none":
+            return Layout(layer_shapes("mean", sizes), {"mean": (sizes, True)})
+        parameters = layer_shapes("mean", sizes) | layer_shapes("error", sizes) | {"error.scale": (sizes[-1], 1)}
+        return Layout(parameters, {"mean": (sizes, True), "error": (sizes, False)})
+
+    @property
+    def _networks(self) -> dict[str, tuple[Learner, Memory | None]]:
+        kept = self._experience
+        networks = {"mean": (kept.mean_learner, kept.mean), "error": (kept.error_learner, kept.error)}
+        return {name: networks[name] for name in self._layout(self._settings).networks}
+
+    def _resume(self, samples: int, networks: Mapping[str, tuple[Learner, Memory | None]]) -> None:
+        kept = self._experience = NetworkExperience(samples)
+        kept.mean_learner, kept.mean = networks["mean"]
+        if "error" in networks:
+            kept.error_learner, kept.error = networks["error"]
 
     def __getstate__(self) -> dict[str, Any]:  # CasADi's functions are built anew, with the parameters' new symbols
         return {**self.__dict__, "_built": {}}
