@@ -98,9 +98,10 @@ class BoundModel:
             traced = self._trace(ca.SX)
         except Exception:
             return self._moments_in(ca.MX, *self._trace(ca.MX), uncertain)
-        function = self._moments_in(ca.SX, *traced, uncertain)
-        if function.n_instructions() <= SCALAR_LIMIT:
-            return function
+        x, y = traced
+        directions = sum(self._sizes[label] for label in uncertain)
+        if ca.Function("y", list(x.values()), list(y.values())).n_instructions() * (1 + directions) <= SCALAR_LIMIT:
+            return self._moments_in(ca.SX, x, y, uncertain)
         return self._moments_in(ca.MX, *self._trace(ca.MX), uncertain)
 
     def _moments_in(

@@ -73,6 +73,21 @@ def unscented(directions: int) -> Rule:
     return Rule(points, np.concatenate([[kappa / total], np.full(2 * directions, 0.5 / total)]))
 
 
+@cache
+def quasi_random(directions: int, count: int = 128) -> Rule:
+    """Return points of a scrambled Sobol sequence with their mirror images, of mean 0 and covariance 1.
+
+    For averages over more directions than a grid can serve, where a relative error of a hundredth will do.
+    """
+    from scipy.special import ndtri
+    from scipy.stats import qmc
+
+    half = ndtri(qmc.Sobol(directions, seed=0).random(count // 2)).T
+    points = np.hstack([half, -half])
+    root = np.linalg.cholesky(points @ points.T / count)
+    return Rule(np.linalg.solve(root, points), np.full(count, 1 / count))
+
+
 def _tensor(nodes: Array, weights: Array, directions: int) -> Rule:
     points = np.array(list(product(nodes, repeat=directions))).T
     return Rule(points, np.array([np.prod(w) for w in product(weights, repeat=directions)]))
@@ -81,10 +96,11 @@ def _tensor(nodes: Array, weights: Array, directions: int) -> Rule:
 def square_root(covariance: Any) -> Any:
     """Return a lower triangular L (n, n) with LLᵀ = Σ, for a covariance (n, n) of SX or MX.
 
-    To the diagonal are added 1e-14 of each variance and 1e-18 of the trace, which vanishes in rounding. Without that,
-    the slope of the square root would be infinite where a variance is zero or a correlation ±1, and gradients NaN; and
-    where the rank is lower than n, rounding would be divided by rounding and grow from column to column. Where Σ = 0
-    the slopes are 0. Of a matrix that is not quite a covariance, the variances are kept.
+    To the diagonal are added 1e-14 of each variance and 1e-18 of the trace, which is lost in rounding as long as the
+    deviations lie within 1e8 of each other. Without that, the slope of the square root would be infinite where a
+    variance is zero or a correlation ±1, and gradients NaN; and where the rank is lower than n, rounding would be
+    divided by rounding and grow from column to column. Where Σ = 0 the slopes are 0. Of a matrix that is not quite a
+    covariance, the variances are kept.
     """
     n = covariance.shape[0]
     if n == 1:
@@ -102,16 +118,14 @@ def _square_root(n: int) -> ca.Function:
     trace = ca.trace(sigma)
     anything = trace > _TINY  # 0 or 1, without a slope
     left = [sigma[i, i] for i in range(n)]  # of the variances, by the columns so far
-
-    def deviation(i: int) -> ca.SX:
-        return ca.sqrt(ca.fmax(ca.fmax(left[i], 0.0) + 1e-14 * sigma[i, i] + 1e-18 * trace, _TINY))
-
+    added = [1e-14 * sigma[i, i] + 1e-18 * trace for i in range(n)]
     factor = ca.SX(n, n)
     for j in range(n):
-        factor[j, j] = deviation(j)
+        most = [ca.sqrt(ca.fmax(ca.fmax(left[i], 0.0) + added[i], _TINY)) for i in range(j, n)]
+        factor[j, j] = most[0]
         for i in range(j + 1, n):
             inner = sum((factor[i, k] * factor[j, k] for k in range(j)), ca.SX(0))
-            most = deviation(i)
-            factor[i, j] = ca.fmin(ca.fmax(anything * (sigma[i, j] - inner) / factor[j, j], -most), most)
+            quotient = anything * (sigma[i, j] - inner) / most[0]
+            factor[i, j] = ca.fmin(ca.fmax(quotient, -most[i - j]), most[i - j])
             left[i] -= factor[i, j] ** 2
     return ca.Function(f"square_root_{n}", [sigma], [factor])

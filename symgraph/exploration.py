@@ -8,9 +8,11 @@ import numpy as np
 
 from symgraph.binding import BoundModel
 from symgraph.optimizers.problem import Problem, Run, Search
+from symgraph.outcomes import NodeOutcomes
 from symgraph.tree import Tree
 
 MOST_DRAWS = 100  # until one has a finite value
+SELDOM = 0.01  # probability below which samples would take too many tries
 
 Decisions = Mapping[str, int]  # selection → which of its choices
 
@@ -22,6 +24,8 @@ def lacking_models(tree: Tree, allowed: Mapping[str, tuple[int, ...]]) -> dict[B
         tree: the unrolled graph.
         allowed: {selection: the choices that are not ruled out}.
     """
+    if not any(model.lacking for model in tree.models):
+        return {}
     selections = tree.graph.selections()
     found: dict[BoundModel, Decisions] = {}
     ways: dict[int, Decisions] = {0: {}}
@@ -56,18 +60,39 @@ def explore(
 ) -> Search:
     """Draw actions and choices at random, with the choices that lead to a model that lacks samples.
 
+    A choice of the guesses is kept where it leads to one. The value, which such a model has a part in, need not be
+    finite: otherwise the model might never get a sample.
+
     Source: Yamaguchi & Atkeson, Humanoids 2016, section VII-A: if no model is available, the actions are random.
     """
-    ways = list(lacking.values())
-    runs = []
+    wanted = [dict(zip(selections, choices.tolist(), strict=True)) for _, choices in problem.guesses]
+    ways = [
+        way
+        for way in lacking.values()
+        if any(all(guess[label] in (-1, choice) for label, choice in way.items()) for guess in wanted)
+    ] or list(lacking.values())
     for _ in range(MOST_DRAWS):
         choices = problem.draw_choices(rng, 1, evenly=False)
         for label, choice in ways[rng.integers(len(ways))].items():
             choices[0, selections.index(label)] = choice
         points = problem.draw_points(rng, 1, "uniform")
         value = float(problem.values(points, choices)[0])
-        runs.append(Run(points[0], points[0], choices[0], value, "drawn", np.array([value])))
         if np.isfinite(value):
             break
+    run = Run(points[0], points[0], choices[0], value if np.isfinite(value) else np.nan, "drawn", np.array([value]))
     needs = dict.fromkeys(f"model {model.name!r} has {model.lacking}" for model in lacking)
-    return Search(runs, f"exploring: {', '.join(needs)}")
+    return Search([run], f"exploring: {', '.join(needs)}")
+
+
+def met(nodes: NodeOutcomes, lacking: Mapping[BoundModel, Decisions]) -> bool:
+    """Whether a plan meets one of the models with a probability that is worth trying."""
+    for node in nodes.tree.nodes:
+        here = nodes.probabilities[node.index]
+        for group in node.groups:
+            if group.group.probability in lacking and here >= SELDOM:
+                return True
+            for branch in group.branches:
+                reach = here if branch.child is None else nodes.probabilities[branch.child]
+                if branch.branch.model in lacking and not reach < SELDOM:
+                    return True
+    return False

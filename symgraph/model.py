@@ -36,6 +36,8 @@ class Propagator(Protocol):
 class Parameter:
     """Numbers inside a model that may change without a rebuild, such as a network's weights.
 
+    Derivatives of an objective by parameters are not taken: CasADi finds 0 for them.
+
     Args:
         value: number or array; its shape is kept for good.
 

@@ -8,8 +8,9 @@ from typing import Any, overload
 
 import numpy as np
 
+from symgraph.binding import BoundModel
 from symgraph.errors import InputError, SolveError, did_you_mean, names
-from symgraph.exploration import explore, lacking_models
+from symgraph.exploration import Decisions, explore, lacking_models, met
 from symgraph.objective import Objective, Situation, check_choice, checked_column, stacked_index
 from symgraph.optimizers.lbfgs import Lbfgs
 from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
@@ -66,8 +67,11 @@ def solve(
         rng = np.random.default_rng(seed)
         selections = list(objective.graph.selections())
         lacking = lacking_models(objective.tree, dict(zip(selections, problem.allowed, strict=True)))
-        search = explore(problem, selections, lacking, rng) if lacking else optimizer.run(problem, rng)
-    best = best_of(search.runs)
+        search = _explored(objective, situation, problem, selections, lacking, rng) if lacking else None
+        explores = search is not None
+        if search is None:
+            search = optimizer.run(problem, rng)
+    best = search.runs[0] if explores else best_of(search.runs)
     if best is None:
         if search.interrupted:
             raise KeyboardInterrupt
@@ -80,14 +84,34 @@ def solve(
         selections=chosen,
         value=best.value,
         status=f"interrupted: best of {len(search.runs)} runs" if search.interrupted else search.status,
-        notes=(*_held_outside(objective, fixed or {}), *nodes.notes()),
+        notes=(*_held_outside(objective, fixed or {}), *nodes.notes(), *([] if explores else _seldom(lacking))),
         nodes=nodes,
         runs=_Runs(objective, search.runs),
-        optimizer="uniform draw" if lacking else type(optimizer).__name__,
+        optimizer="uniform draw" if explores else type(optimizer).__name__,
         seed=int(seed),
         seconds=time.perf_counter() - begin,
         units={label: slot.unit for label, slot in planned_or_seen.items() if slot.unit},
     )
+
+
+def _explored(
+    objective: Objective,
+    situation: Situation,
+    problem: Problem,
+    selections: list[str],
+    lacking: Mapping[BoundModel, Decisions],
+    rng: np.random.Generator,
+) -> Search | None:
+    """Return a random plan, or None where it would meet what lacks samples too seldom."""
+    search = explore(problem, selections, lacking, rng)
+    drawn = search.runs[0]
+    nodes = objective.outcomes_of(situation, drawn.point, _selections(objective, drawn))
+    return search if met(nodes, lacking) else None
+
+
+def _seldom(lacking: Mapping[BoundModel, Decisions]) -> list[str]:
+    """Say which models were planned with although they lack samples."""
+    return [f"model {model.name!r} has {model.lacking}; it is met too seldom to explore" for model in lacking]
 
 
 def _problem(

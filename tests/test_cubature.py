@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from small_tasks import assert_close
 
-from symgraph.cubature import gauss_hermite, on_axes, square_root, trapezoidal, unscented
+from symgraph.cubature import gauss_hermite, on_axes, quasi_random, square_root, trapezoidal, unscented
 
 
 def normal_moment(powers):
@@ -195,3 +195,12 @@ def test_what_is_exact_beside_something_uncertain_is_spread_by_rounding():
     """By 1e-9 of the root of the trace."""
     root = np.array(ca.evalf(square_root(ca.SX([[4.0, 0.0], [0.0, 0.0]]))))
     assert_close(root, [[2, 0], [0, 2e-9]], 1e-13)
+
+
+@pytest.mark.parametrize("directions", [1, 3, 7])
+def test_quasi_random_points_have_mean_zero_and_covariance_one(directions):
+    rule = quasi_random(directions)
+    assert_close(rule.points @ rule.weights, 0, 1e-12)
+    assert_close((rule.points * rule.weights) @ rule.points.T, np.eye(directions), 1e-12)
+    even = np.mean(np.abs(rule.points))  # E|z| = √(2/π)
+    assert even == pytest.approx(np.sqrt(2 / np.pi), rel=0.02)

@@ -1,5 +1,6 @@
 """Plans while a model has too few samples: random, but such that the model gets some."""
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -90,6 +91,36 @@ def test_a_model_further_down_counts_too():
     assert plan.status == "exploring: model 'F_late' has 0 of 10 samples"
     assert plan.selections == {"way": "right"}
     assert plan.runs[0].outcome == "drawn"
+
+
+def test_a_guess_keeps_its_choice(skills):
+    objective = skills[2]
+    chosen = [sg.solve(objective, {}, guess={"skill": "tip"}, seed=seed).selections["skill"] for seed in range(8)]
+    assert set(chosen) == {"tip"}
+
+
+def test_explores_although_the_value_is_not_finite():
+    """An unfitted network gives 0, of which the reward is infinite; only a sample can change that."""
+    graph = sg.Graph({"a": sg.Action(low=0.0, high=1.0), "y": sg.State()}, start="here")
+    graph.edge("here", "there", StochasticNetwork({"a": 1}, {"y": 1}, hidden=(4,), error="none", name="F"))
+    graph.reward("there", lambda y: ca.log(y))
+    plan = sg.solve(sg.Objective(sg.unroll(graph)), {})
+    assert plan.status == "exploring: model 'F' has 0 of 3 samples"
+    assert 0.0 <= plan.actions["a"] <= 1.0
+    assert np.isnan(plan.value)
+
+
+@pytest.mark.parametrize(("share", "explores"), [(0.001, False), (0.2, True)])
+def test_what_is_seldom_met_does_not_keep_a_plan_waiting(share, explores):
+    graph = sg.Graph({"a": sg.Action(low=0.0, high=1.0), "y": sg.State()}, start="here")
+    branches = {"rare": ("there", network("F_rare")), "usual": ("there", lambda a: {"y": a})}
+    graph.chance("here", branches, {"rare": share, "usual": 1.0 - share})
+    graph.reward("there", lambda y: y)
+    plan = sg.solve(sg.Objective(sg.unroll(graph)), {})
+    assert plan.status.startswith("exploring") == explores
+    if not explores:
+        assert plan.actions["a"] > 0.99
+        assert "model 'F_rare' has 0 of 3 samples; it is met too seldom to explore" in plan.notes
 
 
 def test_models_of_ones_own_may_lack_something_too():

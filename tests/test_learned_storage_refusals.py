@@ -217,7 +217,7 @@ FORGED = {
     "whole": (replaced("mean.weights_0", lambda a: a.astype(np.int64)), ["is I64", "not F64"]),
     "nan": (replaced("mean.weights_1", poisoned(np.nan)), ["'mean.weights_1'", "not finite"]),
     "infinite": (replaced("error.copies.biases_2", poisoned(np.inf)), ["'error.copies.biases_2'", "not finite"]),
-    "no deviation": (replaced("mean.y_sd", poisoned(0.0)), ["'mean': the scaling of y", "above 0"]),
+    "no deviation": (replaced("mean.y_sd", poisoned(-1.0)), ["'mean': the scaling of y", "no deviation is below 0"]),
     "sixth fold": (replaced("mean.folds", poisoned(5)), ["'mean'", "fold that does not exist"]),
     "sample twice": (replaced("mean.known", lambda a: np.repeat(a[:1], len(a), 0)), ["'mean'", "stands in it twice"]),
 }

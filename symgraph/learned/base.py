@@ -10,12 +10,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
+import casadi as ca
 import numpy as np
 
 from symgraph.errors import InputError
 from symgraph.learned import snapshot, storage
 from symgraph.learned.gaussians import RULES
-from symgraph.learned.inputs import checked_count, checked_hidden, checked_option, checked_sizes
+from symgraph.learned.inputs import checked_count, checked_hidden, checked_option, checked_sizes, mean_and_root
 from symgraph.learned.learner import Learner, Memory
 from symgraph.model import Parameter
 from symgraph.slots import Gaussian
@@ -56,6 +57,14 @@ class LearnedModel(ABC):
     @abstractmethod
     def propagate(self, inputs: Mapping[str, Gaussian]) -> dict[str, Gaussian]:
         """Return {label: Gaussian} of what it writes, as expressions of its parameters; see `Propagator`."""
+
+    def _stacked(self, inputs: Mapping[str, Gaussian]) -> tuple[ca.MX, ca.MX | None]:
+        """Stack what it reads to a mean (n, 1) and a root (n, d)."""
+        for label, size in self.reads.items():
+            found = inputs[label].mean.numel()
+            if found != size:
+                raise InputError(f"{self.name} reads {label!r} with {size} elements; the slot has {found}")
+        return mean_and_root([inputs[label] for label in self.reads])
 
     @property
     def samples(self) -> int:

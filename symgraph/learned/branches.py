@@ -10,12 +10,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from symgraph.cubature import gauss_hermite, on_axes, square_root
+from symgraph.cubature import gauss_hermite, quasi_random, square_root
 from symgraph.errors import InputError, did_you_mean, names
 from symgraph.learned import losses
 from symgraph.learned.base import Experience, LearnedModel, layer_sizes
-from symgraph.learned.gaussians import Mixture, at_points, pass_through, splits
-from symgraph.learned.inputs import checked_pair, checked_rows, mean_and_root
+from symgraph.learned.gaussians import Mixture, pass_through
+from symgraph.learned.inputs import checked_pair, checked_rows, checked_seed
 from symgraph.learned.learner import Learner, Memory
 from symgraph.learned.perceptron import Perceptron, Scaling
 from symgraph.learned.snapshot import Layout, layer_shapes
@@ -23,7 +23,7 @@ from symgraph.model import Parameter
 from symgraph.progress import Progress
 from symgraph.slots import Array, Gaussian
 
-HERMITE = {1: 9, 2: 7}  # points for each difference of logits, by their number
+HERMITE = {1: 9, 2: 5}  # points for each difference of logits, by their number
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ class BranchExperience(Experience):
 class BranchNetwork(LearnedModel):
     """A network that gives each branch of a chance its probability, for `graph.chance(…, probability=…)`.
 
-    p = softmax(f(x)); for x ~ N(μ, Σ) the expectation E[p] over what is propagated. The probabilities are positive and
-    sum to 1.
+    p = softmax(f(x)); for x ~ N(μ, Σ) the expectation E[p] over what is propagated. The probabilities sum
+    to 1.
 
     Args:
         reads: {label: number of elements} of the inputs, in the order of the columns of x.
@@ -91,8 +91,8 @@ class BranchNetwork(LearnedModel):
         name: str = "branches",
     ) -> None:
         super().__init__(reads, hidden, propagation, samples_needed, name)
-        listed = () if isinstance(branches, str) else tuple(branches)
-        if len(set(listed)) < max(2, len(listed)) or not all(isinstance(b, str) and b for b in listed):
+        listed = tuple(branches) if isinstance(branches, Sequence) and not isinstance(branches, str) else ()
+        if not all(isinstance(b, str) and b for b in listed) or len(set(listed)) < max(2, len(listed)):
             raise InputError(f"{self.name}: branches = {branches!r}; give two or more different names")
         self.writes = listed
         self._logits = Perceptron((sum(self.reads.values()), *self.hidden, len(listed)), self.name)
@@ -105,12 +105,7 @@ class BranchNetwork(LearnedModel):
 
     def propagate(self, inputs: Mapping[str, Gaussian]) -> dict[str, Gaussian]:
         """Return {branch: its probability}, as expressions of its parameters."""
-        mean, root = mean_and_root([inputs[label] for label in self.reads])
-        if root is not None and splits(self.propagation, root):
-            passed = at_points(self._logits.layers, mean, root)
-        else:
-            passed = pass_through(self.propagation, self._logits.layers, mean, root)
-        p = _expected_softmax(passed)
+        p = _expected_softmax(pass_through(self.propagation, self._logits.layers, *self._stacked(inputs)))
         return {branch: Gaussian(p[i]) for i, branch in enumerate(self.writes)}
 
     def predict(self, mean: Any) -> Array:
@@ -139,7 +134,10 @@ class BranchNetwork(LearnedModel):
             MissingExtraError: torch is not installed.
         """
         begin = time.perf_counter()
+        rng = checked_seed(seed, self.name)
         x = checked_rows(x, self._logits.sizes[0], f"{self.name}: x")
+        if isinstance(happened, str) or not all(isinstance(b, str) for b in happened):
+            raise InputError(f"{self.name}: happened = {happened!r}; give a list of names, one for each row of x")
         happened = list(happened)
         checked_pair(x, happened, self.name)
         unknown = [b for b in happened if b not in self.writes]
@@ -147,25 +145,27 @@ class BranchNetwork(LearnedModel):
             hint = did_you_mean(unknown[0], self.writes)
             raise InputError(f"{self.name}: {unknown[0]!r} is no branch{hint} Branches: {names(self.writes)}")
         hot = np.array([[float(b == branch) for branch in self.writes] for b in happened])
-        kept, scaling = self._experience, (Scaling.of(x), None)
+        scaling = Scaling.of(x), None
         frequency = (hot.sum(axis=0) + 1.0) / (len(hot) + len(self.writes))  # Laplace's: no branch is impossible
+        learner = self._experience.learner.copied()
         with Progress(f"fitting {self.name}", progress) as bar:
-            schedule = kept.learner.schedule(x, hot)
-            kept.memory, trained = kept.learner.fit(
-                kept.memory,
+            plan = learner.plan(x, hot)
+            memory, trained = learner.fit(
+                self._experience.memory,
                 self._logits.sizes,
                 x,
                 hot,
                 scaling,
                 losses.cross_entropy,
-                schedule,
-                np.random.default_rng(seed),
+                plan,
+                rng,
                 bar,
                 np.log(frequency),
             )
-        self._logits.set(kept.memory.copies, *scaling)
-        kept.samples = len(x)
-        return BranchReport(len(x), schedule.warm, trained.steps, trained.loss, time.perf_counter() - begin)
+        # Only now, so that a fit that was interrupted has changed nothing.
+        self._logits.set(memory.copies, *scaling)
+        self._experience.learner, self._experience.memory, self._experience.samples = learner, memory, len(x)
+        return BranchReport(len(x), plan.warm, trained.steps, trained.loss, time.perf_counter() - begin)
 
     @property
     def _settings(self) -> dict[str, Any]:
@@ -188,19 +188,23 @@ class BranchNetwork(LearnedModel):
 
 
 def _expected_softmax(logits: Mixture) -> ca.MX:
-    """Return E[softmax] (m, 1) over points or over one Gaussian.
+    """Return E[softmax] (m, 1).
 
-    Only differences of logits matter, which are one fewer.
+    Only differences of logits matter, which are one fewer; over each component's they are averaged at points.
     """
-    if logits.within is None:
+    if logits.covariance_of is None:
         return ca.mtimes(_softmax(logits.means), ca.DM(logits.weights))
     m = logits.means.shape[0]
     differences = ca.DM(np.hstack([np.eye(m - 1), -np.ones((m - 1, 1))]))
-    order = HERMITE.get(m - 1)
-    rule = gauss_hermite(m - 1, order) if order else on_axes(m - 1)
-    root = square_root(ca.mtimes([differences, logits.covariance, differences.T]))
-    columns = ca.repmat(ca.mtimes(differences, logits.mean), 1, len(rule.weights)) + ca.mtimes(root, ca.DM(rule.points))
-    return ca.mtimes(_softmax(ca.vertcat(columns, ca.MX(1, len(rule.weights)))), ca.DM(rule.weights))
+    rule = gauss_hermite(m - 1, HERMITE[m - 1]) if m - 1 in HERMITE else quasi_random(m - 1)
+    middles = ca.mtimes(differences, logits.means)
+    columns = []
+    for k in range(len(logits.weights)):
+        root = square_root(ca.mtimes([differences, logits.covariance_of(k), differences.T]))
+        columns.append(ca.repmat(middles[:, k], 1, len(rule.weights)) + ca.mtimes(root, ca.DM(rule.points)))
+    joined = ca.horzcat(*columns)
+    weights = ca.DM(np.kron(logits.weights, rule.weights))
+    return ca.mtimes(_softmax(ca.vertcat(joined, ca.MX(1, joined.shape[1]))), weights)
 
 
 def _softmax(columns: ca.MX) -> ca.MX:

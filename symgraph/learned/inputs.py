@@ -14,6 +14,8 @@ from symgraph.slots import Array, Gaussian, as_numbers
 
 Option = TypeVar("Option", bound=str)
 
+LARGEST = 1e100  # of a sample's numbers: their squares must still be numbers
+
 
 def checked_sizes(given: Any, place: str) -> dict[str, int]:
     """Return {label: number of elements}.
@@ -67,9 +69,10 @@ def checked_rows(given: Any, size: int, place: str) -> Array:
         array = array[:, None]
     if array.ndim != 2 or array.shape[1] != size or not len(array):
         raise InputError(f"{place} has shape {array.shape}; give (N, {size}), a row per sample")
-    if not np.isfinite(array).all():
-        row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
-        raise InputError(f"{place}[{row}] = {array[row].tolist()} is not finite; leave such samples out")
+    for wrong, what in ((~np.isfinite(array), "not finite"), (np.abs(array) > LARGEST, f"beyond ±{LARGEST:g}")):
+        if wrong.any():
+            row = int(np.flatnonzero(wrong.any(axis=1))[0])
+            raise InputError(f"{place}[{row}] = {array[row].tolist()} is {what}; leave such samples out")
     return array
 
 
@@ -77,6 +80,13 @@ def checked_pair(x: Array, y: Sequence[Any] | Array, place: str) -> None:
     """Raise InputError unless there are as many of one as of the other."""
     if len(x) != len(y):
         raise InputError(f"{place}: x has {len(x)} rows, y {len(y)}; give as many of both")
+
+
+def checked_seed(seed: Any, place: str) -> np.random.Generator:
+    """Return the source of randomness of a seed; raise InputError naming the place where it is none."""
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise InputError(f"{place}: seed = {seed!r}; give a whole number of at least 0")
+    return np.random.default_rng(int(seed))
 
 
 def mean_and_root(gaussians: Sequence[Gaussian]) -> tuple[ca.MX, ca.MX | None]:

@@ -54,25 +54,41 @@ class Learner:
     """Keeps folds and decides, fit by fit, whether to go on from the weights there are.
 
     A warm start is quick, but networks that began on few samples generalise worse than fresh ones (Ash & Adams, On
-    warm-starting neural network training, NeurIPS 2020). So a fit begins anew whenever the samples have grown by half,
-    or when more than a third of them are new.
+    warm-starting neural network training, NeurIPS 2020). So a fit goes on only while two thirds of its samples were
+    there at the last fit from scratch.
+
+    Attributes:
+        folds: of all samples since the last fit from scratch, those of that fit first.
+        begun_with: different samples of that fit.
     """
 
     def __init__(self) -> None:
         self.folds = Folds()
-        self.begun_with = 0  # samples at the last fit from scratch
+        self.begun_with = 0
 
-    def schedule(self, *columns: Array) -> Schedule:
-        """Plan a fit to samples (N, …)."""
+    def copied(self) -> Learner:
+        """Return a copy to plan a fit with: an interrupted fit must leave everything as it was."""
+        other = Learner()
+        other.folds, other.begun_with = Folds(dict(self.folds.known)), self.begun_with
+        return other
+
+    def plan(self, *columns: Array, warm: bool | None = None) -> Schedule:
+        """Give samples (N, …) their folds, and say how a fit to them goes.
+
+        Args:
+            columns: inputs and outputs of the samples.
+            warm: whether it goes on from the weights there are; decided by the samples if left out.
+        """
         n = len(columns[0])
-        warm = 0 < self.begun_with <= n < GROWTH * self.begun_with and self.folds.count_known(*columns) > n / GROWTH
+        if warm is None:
+            warm = self.folds.count_first(self.begun_with, *columns) > n / GROWTH
         if not warm:
-            self.begun_with = n
             self.folds = Folds()
+        folds = self.folds.assign(*columns)
+        if not warm:
+            self.begun_with = len(self.folds.known)
         steps = default_steps(n)
-        return Schedule(
-            self.folds.assign(*columns), active_folds(n), warm, round(WARM_SHARE * steps) if warm else steps
-        )
+        return Schedule(folds, active_folds(n), warm, round(WARM_SHARE * steps) if warm else steps)
 
     def fit(
         self,

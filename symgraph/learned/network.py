@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -9,20 +10,21 @@ from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
 
 from symgraph.compile.interpreted import FlatFunction
 from symgraph.cubature import gauss_hermite, square_root
-from symgraph.errors import InputError
+from symgraph.errors import InputError, SlotError
 from symgraph.learned import losses
 from symgraph.learned.base import Experience, LearnedModel, layer_sizes
-from symgraph.learned.gaussians import Mixture, pass_cheaply, pass_through
-from symgraph.learned.inputs import checked_option, checked_pair, checked_rows, checked_sizes, mean_and_root
-from symgraph.learned.learner import Learner, Memory
+from symgraph.learned.gaussians import Mixture, pass_through
+from symgraph.learned.inputs import checked_option, checked_pair, checked_rows, checked_seed, checked_sizes
+from symgraph.learned.learner import Learner, Memory, Schedule
 from symgraph.learned.perceptron import Perceptron, Scaling
 from symgraph.learned.snapshot import Layout, layer_shapes
 from symgraph.model import Parameter
 from symgraph.progress import Progress
-from symgraph.slots import Array, Gaussian
+from symgraph.slots import Array, Gaussian, as_covariance, as_numbers
 
 ErrorModel = Literal["likelihood", "paper", "none"]
 ERROR_MODELS: tuple[ErrorModel, ...] = ("likelihood", "paper", "none")
@@ -37,7 +39,8 @@ class FitReport:
         samples: how many there were.
         warm: whether it went on from the weights of the fit before.
         steps: of the mean network and of the error network.
-        rmse: (m,) root mean square error on samples that were left out [units of the outputs].
+        rmse: (m,) root mean square error on samples that were left out, which also decided when to stop [units of the
+            outputs].
         seconds: wall time [s].
     """
 
@@ -68,7 +71,7 @@ class StochasticNetwork(LearnedModel):
     """A network of rectified linear units that predicts a mean and its own error, and propagates Gaussians.
 
     y ~ N(f(x), diag(σ²(x))) for an exact x; for x ~ N(μ, Σ) mean and covariance of f are propagated through the layers
-    and E[σ²(x)] is added.
+    and E[σ²(x)] is added (with the paper's error model (E σ(x))²).
 
     Args:
         reads: {label: number of elements} of the inputs, in the order of the columns of x.
@@ -106,7 +109,8 @@ class StochasticNetwork(LearnedModel):
         self._error = Perceptron(sizes, f"{self.name}_error")
         self._error_scale = Parameter(np.ones(sizes[-1]), f"{self.name}_error_scale")  # [units of the outputs]
         self._experience: NetworkExperience = NetworkExperience()
-        self._built: dict[str, FlatFunction] = {}  # (mean, covariance) → (mean, covariance), by rule
+        # (mean, covariance) → (mean, covariance), by the rule and by which elements form a Gaussian of their own
+        self._built: dict[tuple[str, tuple[tuple[int, ...], ...]], FlatFunction] = {}
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -117,7 +121,7 @@ class StochasticNetwork(LearnedModel):
 
     def propagate(self, inputs: Mapping[str, Gaussian]) -> dict[str, Gaussian]:
         """Return the Gaussians of what it writes, as expressions of its parameters."""
-        y, covariance = self._moments(*mean_and_root([inputs[label] for label in self.reads]))
+        y, covariance = self._moments(*self._stacked(inputs))
         written, at = {}, 0
         for label, size in self.writes.items():
             rows = slice(at, at + size)
@@ -130,13 +134,13 @@ class StochasticNetwork(LearnedModel):
 
         Args:
             mean: (n,) or (N, n) inputs, in the order of `reads`.
-            covariance: (n, n), or (N, n, n), of the inputs; left out: exact.
+            covariance: (n, n), or (N, n, n), of the inputs; left out: exact, as is a label whose rows are 0.
 
         Returns:
             (m,) and (m, m), or (N, m) and (N, m, m), in the order of `writes`.
 
         Raises:
-            InputError: arrays of other shapes.
+            InputError: arrays of other shapes, or no covariances.
         """
         n, m = self._mean.sizes[0], self._mean.sizes[-1]
         single = np.ndim(mean) == 1
@@ -144,13 +148,9 @@ class StochasticNetwork(LearnedModel):
         if covariance is None:
             y, spread = self._mean(x), self._variance(x)[:, :, None] * np.eye(m)
         else:
-            sigma = np.asarray(covariance, dtype=float)
-            if sigma.shape not in ((n, n), (len(x), n, n)):
-                expected = f"({n}, {n})" + ("" if single else f" or ({len(x)}, {n}, {n})")
-                raise InputError(f"{self.name}: covariance has shape {sigma.shape}; give {expected}")
+            sigma = self._checked_covariances(covariance, len(x), single)
             shared = [p.value.ravel(order="F") for p in self.parameters]
-            blocks = np.broadcast_to(sigma, (len(x), n, n))
-            rows = [self._numbers([row, block.ravel(), *shared]) for row, block in zip(x, blocks, strict=True)]
+            rows = [self._numbers(block)([row, block.ravel(), *shared]) for row, block in zip(x, sigma, strict=True)]
             y, spread = np.array([row[0] for row in rows]), np.array([row[1].reshape(m, m) for row in rows])
         return (y[0], spread[0]) if single else (y, spread)
 
@@ -168,52 +168,89 @@ class StochasticNetwork(LearnedModel):
             MissingExtraError: torch is not installed.
         """
         begin = time.perf_counter()
+        rng = checked_seed(seed, self.name)
         x = checked_rows(x, self._mean.sizes[0], f"{self.name}: x")
         y = checked_rows(y, self._mean.sizes[-1], f"{self.name}: y")
         checked_pair(x, y, self.name)
-        rng = np.random.default_rng(seed)
         scaling = Scaling.of(x), Scaling.of(y)
         kept = self._experience
+        mean_learner, error_learner, error = kept.mean_learner.copied(), kept.error_learner.copied(), kept.error
         with Progress(f"fitting {self.name}", progress) as bar:
-            schedule = kept.mean_learner.schedule(x, y)
-            kept.mean, trained = kept.mean_learner.fit(
-                kept.mean, self._mean.sizes, x, y, scaling, losses.squares, schedule, rng, bar
-            )
-            self._mean.set(kept.mean.copies, *scaling)
-            errors = scaling[1](y) - trained.outputs
-            held_out = ~np.isnan(errors).any(axis=1)
+            plan = mean_learner.plan(x, y)
+            mean, trained = mean_learner.fit(kept.mean, self._mean.sizes, x, y, scaling, losses.squares, plan, rng, bar)
+            fitted = Perceptron(self._mean.sizes, "fitted")
+            fitted.set(mean.copies, *scaling)
+            held_out = scaling[1](y) - trained.outputs
             steps: tuple[int, ...] = (trained.steps,)
-            if self.error == "likelihood":
-                steps += (self._fit_error(x[held_out], errors[held_out], scaling, rng, bar),)
-            elif self.error == "paper":
-                steps += (self._fit_error(x, np.abs(scaling[1](y) - scaling[1](self._mean(x))), scaling, rng, bar),)
+            if self.error != "none":
+                rows, errors = self._errors(scaling[1](y) - scaling[1](fitted(x)), held_out)
+                error_plan = error_learner.plan(x[rows], y[rows], warm=plan.warm and error is not None)
+                error, made = self._fit_error(x[rows], errors, scaling[0], error_learner, error_plan, rng, bar)
+                steps += (made,)
+        # Only now, so that a fit that was interrupted has changed nothing.
+        self._mean.set(mean.copies, *scaling)
+        if error is not None and self.error != "none":
+            self._error.set(error.copies, scaling[0], None)
+            self._error_scale.value = scaling[1].divisor
+        kept.mean_learner, kept.error_learner, kept.mean, kept.error = mean_learner, error_learner, mean, error
         kept.samples = len(x)
-        rmse = np.sqrt(np.mean(errors[held_out] ** 2, axis=0)) * scaling[1].sd
-        return FitReport(len(x), schedule.warm, steps, rmse, time.perf_counter() - begin)
+        rmse = np.sqrt(np.nanmean(held_out**2, axis=0)) * scaling[1].divisor
+        return FitReport(len(x), plan.warm, steps, rmse, time.perf_counter() - begin)
+
+    def _errors(self, seen: Array, held_out: Array) -> tuple[npt.NDArray[np.intp], Array]:
+        """Return which samples σ is learned from, and the errors there [standard deviations of the targets].
+
+        Args:
+            seen: (N, m) errors of the network that has learned from all samples.
+            held_out: (N, m) errors of those that have not seen the sample, NaN where all have.
+        """
+        if self.error == "paper":
+            return np.arange(len(seen)), np.abs(seen)
+        rows = np.flatnonzero(~np.isnan(held_out).any(axis=1))
+        return rows, held_out[rows]
 
     def _fit_error(
-        self, x: Array, errors: Array, scaling: tuple[Scaling, Scaling], rng: np.random.Generator, bar: Progress
-    ) -> int:
-        """Learn σ from errors (N, m) [standard deviations of the targets], and return the steps that it took."""
-        kept = self._experience
+        self,
+        x: Array,
+        errors: Array,
+        scaling: Scaling,
+        learner: Learner,
+        plan: Schedule,
+        rng: np.random.Generator,
+        bar: Progress,
+    ) -> tuple[Memory, int]:
+        """Learn σ from errors (N, m), and return where its network stands and the steps that it took."""
         likelihood = self.error == "likelihood"
         # From the errors' size, the same everywhere, it can only get better.
         size = np.sqrt(np.mean(errors**2, axis=0)) + losses.LEAST_DEVIATION
-        kept.error, trained = kept.error_learner.fit(
-            kept.error,
+        memory, trained = learner.fit(
+            self._experience.error,
             self._error.sizes,
             x,
             errors,
-            (scaling[0], None),
+            (scaling, None),
             losses.gaussian if likelihood else losses.asymmetric,
-            kept.error_learner.schedule(x),
+            plan,
             rng,
             bar,
             losses.inverse_softplus(size) if likelihood else size,
         )
-        self._error.set(kept.error.copies, scaling[0], None)
-        self._error_scale.value = scaling[1].sd
-        return trained.steps
+        return memory, trained.steps
+
+    def _checked_covariances(self, given: Any, count: int, single: bool) -> Array:
+        """Return covariances (count, n, n); raise InputError where they are none."""
+        n = self._mean.sizes[0]
+        place = f"{self.name}: covariance"
+        try:
+            sigma = as_numbers(given, place)
+            if sigma.shape == (n, n):
+                return np.broadcast_to(as_covariance(sigma, n, self.name), (count, n, n))
+            if single or sigma.shape != (count, n, n):
+                expected = f"({n}, {n})" + ("" if single else f" or ({count}, {n}, {n})")
+                raise InputError(f"{place} has shape {sigma.shape}; give {expected}")
+            return np.array([as_covariance(one, n, f"{self.name}: row {i}") for i, one in enumerate(sigma)])
+        except SlotError as error:
+            raise InputError(str(error)) from None
 
     def _variance(self, x: Array) -> Array:
         """Return σ² (N, m) at exact inputs (N, n)."""
@@ -228,21 +265,29 @@ class StochasticNetwork(LearnedModel):
         passed = pass_through(self.propagation, self._mean.layers, mean, root)
         if self.error == "none":
             return passed.mean, passed.covariance
-        errors = pass_cheaply(self.propagation, self._error.layers, mean, root)
+        errors = pass_through(self.propagation, self._error.layers, mean, root)
         scale = self._error_scale.symbol
         variance = errors.mean**2 if self.error == "paper" else _expected_square(errors)
         return passed.mean, passed.covariance + ca.diag(variance * scale**2)
 
-    @property
-    def _numbers(self) -> FlatFunction:
-        if self.propagation not in self._built:
+    def _numbers(self, covariance: Array) -> FlatFunction:
+        """Return the function that predicts for a covariance (n, n) of this structure: what a graph would compute."""
+        edges = np.cumsum([0, *self.reads.values()]).tolist()
+        labels = [list(range(a, b)) for a, b in itertools.pairwise(edges)]
+        uncertain = [rows for rows in labels if covariance[rows].any()]
+        if any(covariance[np.ix_(a, b)].any() for a, b in itertools.combinations(uncertain, 2)):
+            uncertain = [
+                [i for rows in uncertain for i in rows]
+            ]  # labels that depend on each other, which a graph's never do
+        key = self.propagation, tuple(tuple(rows) for rows in uncertain)
+        if key not in self._built:
             n = self._mean.sizes[0]
             mean, sigma = ca.MX.sym("mean", n), ca.MX.sym("sigma", n, n)
-            y, covariance = self._moments(mean, square_root(sigma))
+            roots = [ca.mtimes(ca.DM(np.eye(n)[:, rows]), square_root(sigma[rows, rows])) for rows in uncertain]
+            moments = self._moments(mean, ca.horzcat(*roots) if roots else None)
             symbols = [mean, sigma, *(p.symbol for p in self.parameters)]
-            function = ca.Function("predict", symbols, [ca.densify(y), ca.densify(covariance)])
-            self._built[self.propagation] = FlatFunction(function)
-        return self._built[self.propagation]
+            self._built[key] = FlatFunction(ca.Function("predict", symbols, [ca.densify(part) for part in moments]))
+        return self._built[key]
 
     @property
     def _settings(self) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
 
 from symgraph.learned.training import Copies
 from symgraph.model import Parameter
@@ -16,20 +17,33 @@ from symgraph.slots import Array
 
 @dataclass(frozen=True)
 class Scaling:
-    """What turns samples into numbers of mean 0 and standard deviation 1: (x - mean) / sd, each (n,)."""
+    """What turns samples into numbers of mean 0 and standard deviation 1: (x - mean) / sd, each (n,).
+
+    What does not vary has sd 0 and is only shifted.
+    """
 
     mean: Array
     sd: Array
 
     @classmethod
     def of(cls, samples: Array) -> Scaling:
-        """Return the scaling of samples (N, n); what does not vary is only shifted."""
+        """Return the scaling of samples (N, n)."""
         mean, sd = samples.mean(axis=0), samples.std(axis=0)
         constant = sd <= 1e-9 * np.abs(samples).max(axis=0, initial=0.0)
-        return cls(mean, np.where(constant, 1.0, sd))
+        return cls(mean, np.where(constant, 0.0, sd))
+
+    @property
+    def varies(self) -> npt.NDArray[np.bool_]:
+        """(n,)."""
+        return self.sd > 0.0
+
+    @property
+    def divisor(self) -> Array:
+        """(n,): the deviation, or 1 where there is none."""
+        return np.where(self.varies, self.sd, 1.0)
 
     def __call__(self, samples: Array) -> Array:
-        return (samples - self.mean) / self.sd
+        return (samples - self.mean) / self.divisor
 
 
 class Perceptron:
@@ -71,8 +85,9 @@ class Perceptron:
         weights = [w[0].T.astype(float) for w in copies.weights]
         biases = [b[0, 0].astype(float) for b in copies.biases]
         if y is not None:  # before the first layer is changed, which may be the last one too
-            weights[-1], biases[-1] = weights[-1] * y.sd[:, None], biases[-1] * y.sd + y.mean
-        weights[0] = weights[0] / x.sd
+            weights[-1], biases[-1] = weights[-1] * y.divisor[:, None], biases[-1] * y.divisor + y.mean
+        # Of what did not vary nothing was learned, so it must not matter; its weights are still the random ones.
+        weights[0] = np.where(x.varies, weights[0] / x.divisor, 0.0)
         biases[0] = biases[0] - weights[0] @ x.mean
         for parameter, value in zip(self._weights + self._biases, weights + biases, strict=True):
             # CasADi reads columns: laid out like that, no evaluation has to turn them round.
@@ -93,9 +108,9 @@ def rescaled(copies: Copies, before: tuple[Scaling, Scaling | None], after: tupl
     weights, biases = [w.astype(float) for w in copies.weights], [b.astype(float) for b in copies.biases]
     (x0, y0), (x1, y1) = before, after
     if y0 is not None and y1 is not None:
-        weights[-1] = weights[-1] * (y0.sd / y1.sd)
-        biases[-1] = (biases[-1] * y0.sd + y0.mean - y1.mean) / y1.sd
-    # x as before = (x1.mean - x0.mean + x1.sd · x anew) / x0.sd
-    biases[0] = biases[0] + (((x1.mean - x0.mean) / x0.sd) @ weights[0])[:, None]
-    weights[0] = weights[0] * (x1.sd / x0.sd)[:, None]
+        weights[-1] = weights[-1] * (y0.divisor / y1.divisor)
+        biases[-1] = (biases[-1] * y0.divisor + y0.mean - y1.mean) / y1.divisor
+    # x as before = (x1.mean - x0.mean + x1.sd · x anew) / x0.sd, where it varied
+    biases[0] = biases[0] + ((x0.varies * (x1.mean - x0.mean) / x0.divisor) @ weights[0])[:, None]
+    weights[0] = weights[0] * (x0.varies * x1.sd / x0.divisor)[:, None]
     return Copies([w.astype(np.float32) for w in weights], [b.astype(np.float32) for b in biases])

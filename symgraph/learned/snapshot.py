@@ -149,8 +149,8 @@ def unpack(document: Document, arrays: Arrays, layout: Layout) -> Stored:
 
 def _scaling(arrays: Arrays, network: str, axis: str) -> Scaling:
     mean, sd = arrays[f"{network}.{axis}_mean"], arrays[f"{network}.{axis}_sd"]
-    if not (sd > 0).all():
-        raise InputError(f"{network!r}: the scaling of {axis} is {sd.tolist()}; deviations are above 0")
+    if not (sd >= 0).all():
+        raise InputError(f"{network!r}: the scaling of {axis} is {sd.tolist()}; no deviation is below 0")
     return Scaling(mean, sd)
 
 

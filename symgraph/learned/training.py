@@ -9,10 +9,12 @@ from __future__ import annotations
 import hashlib
 import itertools
 import math
+import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -80,9 +82,10 @@ class Folds:
             sizes[self.known[digest]] += times[digest]
         return np.array([self.known[d] for d in digests], dtype=np.int64)
 
-    def count_known(self, *columns: Array) -> int:
-        """Return how many of the samples have a fold already."""
-        return sum(digest in self.known for digest in _digests(columns))
+    def count_first(self, count: int, *columns: Array) -> int:
+        """Return how many of the samples are among the first `count` that got a fold."""
+        first = set(islice(self.known, count))
+        return sum(digest in first for digest in _digests(columns))
 
 
 def _digests(columns: Sequence[Array]) -> list[bytes]:
@@ -174,17 +177,19 @@ def train(
     judged = np.flatnonzero(folds < held_out_copies)
     if len(judged) > MOST_SCORED:
         judged = np.sort(rng.choice(judged, MOST_SCORED, replace=False))
-    judges = torch.from_numpy(1 + folds[judged])
-    rows = torch.from_numpy(judged)
+    judged_by = [torch.from_numpy(judged[folds[judged] == k]) for k in range(held_out_copies)]
 
     tensors = [torch.from_numpy(a.copy()) for pair in zip(copies.weights, copies.biases, strict=True) for a in pair]
     average = [tensor.clone() for tensor in tensors]
     best = [tensor.clone() for tensor in tensors]
 
     def held_out_loss() -> float:
+        total = 0.0
         with torch.no_grad():
-            losses = loss(_forward(average, inputs[rows]), wanted[rows])
-        return float(losses[judges, torch.arange(len(rows))].mean())
+            for k, rows in enumerate(judged_by):
+                one = [tensor[1 + k : 2 + k] for tensor in average]
+                total += float(loss(_forward(one, inputs[rows]), wanted[rows]).sum())
+        return total / max(1, len(judged))
 
     batch = min(n, max(32, COLUMNS // copies.count))
     order, at = rng.permutation(n), 0
@@ -251,13 +256,20 @@ def import_torch() -> Any:
     return torch
 
 
+_fitting = threading.Lock()
+
+
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Compute on one core: the matrices are small, and the same sums in the same order give the same weights."""
+    """Compute on one core: the matrices are small, and the same sums in the same order give the same weights.
+
+    The number of threads belongs to the process, so fits in several threads take turns.
+    """
     torch = import_torch()
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+    with _fitting, torch.enable_grad():  # also where a user has switched gradients off
+        before = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(before)
