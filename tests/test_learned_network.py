@@ -271,17 +271,6 @@ def test_fit_inside_no_grad():
     assert torch.is_grad_enabled()
 
 
-def test_order_of_the_samples_does_not_leak_what_is_held_out():
-    """A sample stays in its fold wherever it stands, so a warm fit never judges by samples it has learned from."""
-    one = network()
-    x, y = samples(60)
-    one.fit(x, y)
-    learner = one._experience.mean_learner
-    before = learner.folds.assign(x, y)
-    order = np.random.default_rng(0).permutation(60)
-    np.testing.assert_array_equal(learner.folds.assign(x[order], y[order]), before[order])
-
-
 def test_error_model_follows_noise_that_depends_on_the_input():
     rng = np.random.default_rng(0)
     x = rng.uniform(0.0, 1.0, (400, 1))
@@ -315,7 +304,7 @@ def test_coverage_on_noisy_samples_in_one_dimension():
     assert abs(shares[1] - 0.95) < 0.03
 
 
-def test_the_papers_error_model_is_overconfident_where_samples_are_few():
+def test_errors_that_were_held_out_say_more_than_the_papers():
     """Errors on training samples say little about new ones; errors on samples that were left out do."""
     rng = np.random.default_rng(0)
     x, xt = rng.uniform(-1.0, 1.0, (100, 4)), rng.uniform(-1.0, 1.0, (2000, 4))

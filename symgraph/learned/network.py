@@ -222,7 +222,7 @@ class StochasticNetwork(LearnedModel):
         """Learn σ from errors (N, m), and return where its network stands and the steps that it took."""
         likelihood = self.error == "likelihood"
         # From the errors' size, the same everywhere, it can only get better.
-        size = np.sqrt(np.mean(errors**2, axis=0)) + losses.LEAST_DEVIATION
+        size = np.sqrt(np.mean(errors**2, axis=0)) + 1e-9  # softplus is never 0
         memory, trained = learner.fit(
             self._experience.error,
             self._error.sizes,

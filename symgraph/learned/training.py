@@ -211,7 +211,8 @@ def train(
             optimizer.zero_grad()
             ((losses * weight).sum(1) / weight.sum(1).clamp(min=1.0)).sum().backward()
             optimizer.step()
-            torch._foreach_lerp_(average, [tensor.detach() for tensor in tensors], 1 - AVERAGING)
+            for mean, tensor in zip(average, tensors, strict=True):
+                mean.lerp_(tensor.detach(), 1 - AVERAGING)
             made = step + 1
             if made % EVERY == 0 or made == steps:
                 progress.update(made, steps)
