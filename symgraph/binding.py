@@ -12,7 +12,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from symgraph.errors import GraphError, SlotError, did_you_mean, names
+from symgraph.errors import GraphError, SlotError, SymgraphError, did_you_mean, names
 from symgraph.model import Model, Parameter, is_propagator
 from symgraph.propagation import RULES
 from symgraph.slots import Array, Gaussian, Slot, State, as_covariance
@@ -353,6 +353,8 @@ def _call_propagator(
         inputs[name] = Gaussian(x[label], sigma.get(label, ca.MX(n, n)))
     try:
         returned = function.propagate(inputs)
+    except SymgraphError as error:
+        raise GraphError(f"{place}: {error}") from error
     except Exception as error:
         raise GraphError(f"{place} raised {type(error).__name__} in propagate: {error}") from error
     if not isinstance(returned, Mapping) or not all(isinstance(g, Gaussian) for g in returned.values()):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
 
 import numpy as np
@@ -55,9 +56,7 @@ def lacking_models(tree: Tree, allowed: Mapping[str, tuple[int, ...]]) -> dict[B
     return found
 
 
-def explore(
-    problem: Problem, selections: list[str], lacking: Mapping[BoundModel, Decisions], rng: np.random.Generator
-) -> Search:
+def explore(problem: Problem, selections: list[str], lacking: Mapping[BoundModel, Decisions], seed: int) -> Search:
     """Draw actions and choices at random, with the choices that lead to a model that lacks samples.
 
     A choice of the guesses is kept where it leads to one. The value, which such a model has a part in, need not be
@@ -71,6 +70,10 @@ def explore(
         for way in lacking.values()
         if any(all(guess[label] in (-1, choice) for label, choice in way.items()) for guess in wanted)
     ] or list(lacking.values())
+    needs = dict.fromkeys(f"model {model.name!r} has {model.lacking}" for model in lacking)
+    status = f"exploring: {', '.join(needs)}"
+    # Another draw with every sample that has come in, so that a loop that leaves the seed alone tries various actions.
+    rng = np.random.default_rng([seed, zlib.crc32(status.encode())])
     for _ in range(MOST_DRAWS):
         choices = problem.draw_choices(rng, 1, evenly=False)
         for label, choice in ways[rng.integers(len(ways))].items():
@@ -80,8 +83,7 @@ def explore(
         if np.isfinite(value):
             break
     run = Run(points[0], points[0], choices[0], value if np.isfinite(value) else np.nan, "drawn", np.array([value]))
-    needs = dict.fromkeys(f"model {model.name!r} has {model.lacking}" for model in lacking)
-    return Search([run], f"exploring: {', '.join(needs)}")
+    return Search([run], status)
 
 
 def met(nodes: NodeOutcomes, lacking: Mapping[BoundModel, Decisions]) -> bool:

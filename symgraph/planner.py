@@ -67,7 +67,7 @@ def solve(
         rng = np.random.default_rng(seed)
         selections = list(objective.graph.selections())
         lacking = lacking_models(objective.tree, dict(zip(selections, problem.allowed, strict=True)))
-        search = _explored(objective, situation, problem, selections, lacking, rng) if lacking else None
+        search = _explored(objective, situation, problem, selections, lacking, int(seed)) if lacking else None
         explores = search is not None
         if search is None:
             search = optimizer.run(problem, rng)
@@ -100,10 +100,10 @@ def _explored(
     problem: Problem,
     selections: list[str],
     lacking: Mapping[BoundModel, Decisions],
-    rng: np.random.Generator,
+    seed: int,
 ) -> Search | None:
     """Return a random plan, or None where it would meet what lacks samples too seldom."""
-    search = explore(problem, selections, lacking, rng)
+    search = explore(problem, selections, lacking, seed)
     drawn = search.runs[0]
     nodes = objective.outcomes_of(situation, drawn.point, _selections(objective, drawn))
     return search if met(nodes, lacking) else None

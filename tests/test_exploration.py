@@ -54,6 +54,16 @@ def test_both_are_tried_while_both_lack_samples(skills):
     assert 3 <= tried.count("tip") <= 17
 
 
+def test_every_sample_that_comes_in_brings_another_draw(skills):
+    """Otherwise a loop that leaves the seed alone would try one action until it counts as known."""
+    tip, _, objective = skills
+    drawn = [sg.solve(objective, {}).actions["a"]]
+    for count in (1, 2):
+        fit(tip, count)
+        drawn.append(sg.solve(objective, {}).actions["a"])
+    assert len(set(drawn)) == 3
+
+
 def test_same_seed_same_draw(skills):
     objective = skills[2]
     one, two = (sg.solve(objective, {}, seed=4) for _ in range(2))

@@ -191,7 +191,7 @@ REFUSED = {
     "y": (lambda: calibrate(Known(), [[0, 0]], [0.0]), ["y has shape", "(N, 2)"]),
     "rows": (lambda: calibrate(Known(), [[0, 0]], [[0, 0], [1, 1]]), ["x has 1 rows, y 2"]),
     "nan": (lambda: calibrate(Known(), [[0, np.nan]], [[0, 0]]), ["x[0]", "not finite"]),
-    "empty": (lambda: calibrate(Known(), np.zeros((0, 2)), np.zeros((0, 2))), ["x has shape (0, 2)"]),
+    "empty": (lambda: calibrate(Known(), np.zeros((0, 2)), np.zeros((0, 2))), ["x has no rows"]),
     "words": (lambda: calibrate(Known(), "a", [[0, 0]]), ["x = 'a' is not a number"]),
     "no rows": (lambda: calibrate(Known(), 1.0, [[0, 0]]), ["x has shape ()"]),
     "bins": (lambda: calibrate(Known(), [[0, 0]], [[0, 0]], bins=0), ["bins is 0"]),

@@ -88,13 +88,21 @@ def test_fewer_folds_where_one_holds_enough(samples, expected):
 
 
 @pytest.mark.parametrize(
-    ("samples", "expected"),
-    [(1, 150), (120, 150), (200, 250), (2_000, 2_500), (20_000, 6_000)],
+    ("samples", "widest", "expected"),
+    [
+        (1, 200, 150),
+        (120, 100, 150),
+        (200, 200, 250),
+        (2_000, 200, 2_500),
+        (20_000, 200, 6_000),
+        (60, 50, 300),
+        (60, 8, 750),
+    ],
     ids=lambda value: str(value),
 )
-def test_steps_from_scratch(samples, expected):
+def test_steps_from_scratch(samples, widest, expected):
     """As the docstring says."""
-    assert default_steps(samples) == expected
+    assert default_steps(samples, widest) == expected
 
 
 # Where copies begin

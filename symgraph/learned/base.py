@@ -63,7 +63,10 @@ class LearnedModel(ABC):
         for label, size in self.reads.items():
             found = inputs[label].mean.numel()
             if found != size:
-                raise InputError(f"{self.name} reads {label!r} with {size} elements; the slot has {found}")
+                raise InputError(
+                    f"{self.name} reads {label!r} with size {size}, the slot has size {found}; make them the same "
+                    f"(a selection has as many as it has choices)"
+                )
         return mean_and_root([inputs[label] for label in self.reads])
 
     @property

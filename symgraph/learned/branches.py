@@ -15,7 +15,7 @@ from symgraph.errors import InputError, did_you_mean, names
 from symgraph.learned import losses
 from symgraph.learned.base import Experience, LearnedModel, layer_sizes
 from symgraph.learned.gaussians import Mixture, pass_through
-from symgraph.learned.inputs import checked_pair, checked_rows, checked_seed
+from symgraph.learned.inputs import checked_rows, checked_seed
 from symgraph.learned.learner import Learner, Memory
 from symgraph.learned.perceptron import Perceptron, Scaling
 from symgraph.learned.snapshot import Layout, layer_shapes
@@ -137,13 +137,20 @@ class BranchNetwork(LearnedModel):
         rng = checked_seed(seed, self.name)
         x = checked_rows(x, self._logits.sizes[0], f"{self.name}: x")
         if isinstance(happened, str) or not all(isinstance(b, str) for b in happened):
-            raise InputError(f"{self.name}: happened = {happened!r}; give a list of names, one for each row of x")
+            shown = repr(happened) if isinstance(happened, str) else repr(list(happened)[:3])[:60]
+            raise InputError(
+                f"{self.name}: happened = {shown} …; give a name for each row of x. Branches: {names(self.writes)}"
+            )
         happened = list(happened)
-        checked_pair(x, happened, self.name)
+        if len(happened) != len(x):
+            raise InputError(f"{self.name}: x has {len(x)} rows, happened {len(happened)} names; give one for each row")
         unknown = [b for b in happened if b not in self.writes]
         if unknown:
             hint = did_you_mean(unknown[0], self.writes)
-            raise InputError(f"{self.name}: {unknown[0]!r} is no branch{hint} Branches: {names(self.writes)}")
+            row = happened.index(unknown[0])
+            raise InputError(
+                f"{self.name}: happened[{row}] = {unknown[0]!r} is no branch{hint} Branches: {names(self.writes)}"
+            )
         hot = np.array([[float(b == branch) for branch in self.writes] for b in happened])
         scaling = Scaling.of(x), None
         frequency = (hot.sum(axis=0) + 1.0) / (len(hot) + len(self.writes))  # Laplace's: no branch is impossible

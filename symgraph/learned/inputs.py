@@ -67,12 +67,14 @@ def checked_rows(given: Any, size: int, place: str) -> Array:
         raise InputError(str(error)) from None
     if array.ndim == 1 and size == 1:
         array = array[:, None]
-    if array.ndim != 2 or array.shape[1] != size or not len(array):
+    if array.ndim == 2 and array.shape[1] == size and not len(array):
+        raise InputError(f"{place} has no rows; give one per sample")
+    if array.ndim != 2 or array.shape[1] != size:
         raise InputError(f"{place} has shape {array.shape}; give (N, {size}), a row per sample")
     for wrong, what in ((~np.isfinite(array), "not finite"), (np.abs(array) > LARGEST, f"beyond ±{LARGEST:g}")):
         if wrong.any():
             row = int(np.flatnonzero(wrong.any(axis=1))[0])
-            raise InputError(f"{place}[{row}] = {array[row].tolist()} is {what}; leave such samples out")
+            raise InputError(f"{place}[{row}] = {array[row].tolist()} is {what}; leave such rows out")
     return array
 
 

@@ -47,7 +47,6 @@ class Schedule:
     folds: npt.NDArray[np.int64]
     active: int
     warm: bool
-    steps: int
 
 
 class Learner:
@@ -87,8 +86,7 @@ class Learner:
         folds = self.folds.assign(*columns)
         if not warm:
             self.begun_with = len(self.folds.known)
-        steps = default_steps(n)
-        return Schedule(folds, active_folds(n), warm, round(WARM_SHARE * steps) if warm else steps)
+        return Schedule(folds, active_folds(n), warm)
 
     def fit(
         self,
@@ -125,5 +123,7 @@ class Learner:
             if last_bias is not None:
                 copies.biases[-1][:] = last_bias
         targets = y if scaling[1] is None else scaling[1](y)
-        training = train(copies, scaling[0](x), targets, schedule.folds, loss, schedule.steps, rng, progress)
+        steps = default_steps(len(x), max(sizes[1:-1], default=100))
+        steps = round(WARM_SHARE * steps) if schedule.warm else steps
+        training = train(copies, scaling[0](x), targets, schedule.folds, loss, steps, rng, progress)
         return Memory(training.copies, *scaling), training

@@ -51,7 +51,7 @@ class FitReport:
     seconds: float
 
     def __str__(self) -> str:
-        errors = ", ".join(f"{error:.3g}" for error in self.rmse)
+        errors = ", ".join(f"{error:.3g}" for error in self.rmse) if self.samples > 1 else "unknown"
         how = "warm" if self.warm else "from scratch"
         steps = " + ".join(map(str, self.steps))
         return f"{self.samples} samples, {how}, {steps} steps in {self.seconds:.2f} s; held-out RMSE {errors}"

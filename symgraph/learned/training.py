@@ -98,12 +98,13 @@ def active_folds(samples: int) -> int:
     return min(FOLDS, math.ceil(FOLDS * ENOUGH_HELD_OUT / samples))
 
 
-def default_steps(samples: int) -> int:
+def default_steps(samples: int, widest: int) -> int:
     """Return the most steps of a fit from scratch: 150 up to 120 samples, 250 for 200, 2,500 for 2,000, 6,000 at most.
 
+    Layers of less than 100 units learn more slowly, in steps that cost less: they get up to five times as many.
     Jumps are learned late: with a third of these steps, the error on 2,000 samples of one is half as large again.
     """
-    return min(6000, max(150, round(1.25 * samples)))
+    return round(min(6000, max(150, 1.25 * samples)) * min(5.0, max(1.0, 100 / max(1, widest))))
 
 
 def initial_copies(sizes: Sequence[int], x: Array, count: int, rng: np.random.Generator) -> Copies:
