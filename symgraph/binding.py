@@ -52,6 +52,21 @@ class BoundModel:
         self._built: dict[tuple[str, ...], ca.Function] = {}
 
     @property
+    def learner(self) -> Any:
+        """The model itself if it can be fitted to samples, else None."""
+        return self._function if hasattr(self._function, "fit") and is_propagator(self._function) else None
+
+    @property
+    def sources(self) -> dict[str, str]:
+        """{the model's own name: label} of all that it reads."""
+        return dict(self._reads)
+
+    @property
+    def targets(self) -> dict[str, str]:
+        """{the model's own name: label} of all that it writes."""
+        return {name: label for name, (label, _) in self._writes.items()}
+
+    @property
     def lacking(self) -> str | None:
         """What the model still needs before it can be planned with, e.g. "2 of 3 samples"."""
         return getattr(self._function, "lacking", None)

@@ -13,13 +13,20 @@ from typing import Any, Self
 import casadi as ca
 import numpy as np
 
-from symgraph.errors import InputError
+from symgraph.errors import InputError, StorageError
 from symgraph.learned import snapshot, storage
 from symgraph.learned.gaussians import RULES
-from symgraph.learned.inputs import checked_count, checked_hidden, checked_option, checked_sizes, mean_and_root
+from symgraph.learned.inputs import (
+    checked_count,
+    checked_hidden,
+    checked_option,
+    checked_resolution,
+    checked_sizes,
+    mean_and_root,
+)
 from symgraph.learned.learner import Learner, Memory
 from symgraph.model import Parameter
-from symgraph.slots import Gaussian
+from symgraph.slots import Array, Gaussian
 
 
 @dataclass
@@ -41,6 +48,7 @@ class LearnedModel(ABC):
         hidden: Sequence[int],
         propagation: str,
         samples_needed: int,
+        resolution: Mapping[str, Any] | None,
         name: str,
     ) -> None:
         self.name = str(name)
@@ -48,6 +56,7 @@ class LearnedModel(ABC):
         self.hidden = checked_hidden(hidden, f"{self.name}: hidden")
         self.propagation = checked_option(propagation, RULES, f"{self.name}: propagation")
         self.samples_needed = checked_count(samples_needed, f"{self.name}: samples_needed")
+        self.resolution = checked_resolution(resolution, self.reads, f"{self.name}: resolution")
 
     @property
     @abstractmethod
@@ -57,6 +66,11 @@ class LearnedModel(ABC):
     @abstractmethod
     def propagate(self, inputs: Mapping[str, Gaussian]) -> dict[str, Gaussian]:
         """Return {label: Gaussian} of what it writes, as expressions of its parameters; see `Propagator`."""
+
+    @property
+    def _resolutions(self) -> Array:
+        """(n,) smallest deviation that counts, for each input; 0 where none was given."""
+        return np.concatenate([self.resolution.get(label, [0.0] * size) for label, size in self.reads.items()])
 
     def _stacked(self, inputs: Mapping[str, Gaussian]) -> tuple[ca.MX, ca.MX | None]:
         """Stack what it reads to a mean (n, 1) and a root (n, d)."""
@@ -121,6 +135,25 @@ class LearnedModel(ABC):
             parameter.value = np.asfortranarray(value)  # the layout that a fit gives them
         model._resume(stored.samples, stored.networks)
         return model
+
+    def restore(self, path: str | os.PathLike[str]) -> None:
+        """Take over, in place, what a model with the same settings has saved: graphs that hold this one plan with it.
+
+        Raises:
+            StorageError: as `load`; or the file's model has other settings.
+            MissingExtraError: safetensors is not installed.
+        """
+        saved = type(self).load(path)
+        here, there = self._settings, saved._settings
+        other = [name for name in here if here[name] != there[name]]
+        if other:
+            raise StorageError(
+                f"{os.fspath(path)} holds a model with {other[0]} = {there[other[0]]!r}, {self.name!r} has "
+                f"{here[other[0]]!r}; make it with the same settings, or load the file as a new model"
+            )
+        for mine, value in zip(self.parameters, saved.parameters, strict=True):
+            mine.value = value.value
+        self._resume(saved.samples, saved._networks)
 
     @classmethod
     def _layout_of(cls, document: storage.Document) -> snapshot.Layout:

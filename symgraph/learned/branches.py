@@ -72,6 +72,8 @@ class BranchNetwork(LearnedModel):
         hidden: units in each hidden layer.
         propagation: how Gaussians pass, as in `StochasticNetwork`.
         samples_needed: with fewer, plans that need the network explore.
+        resolution: {label: standard deviation, a number or one for each element} up to which an input is taken for a
+            constant that carries noise, of which nothing is learned; 0 where left out [units of the inputs].
         name: shown in messages and pictures.
 
     Raises:
@@ -88,9 +90,10 @@ class BranchNetwork(LearnedModel):
         *,
         propagation: str = "auto",
         samples_needed: int = 3,
+        resolution: Mapping[str, Any] | None = None,
         name: str = "branches",
     ) -> None:
-        super().__init__(reads, hidden, propagation, samples_needed, name)
+        super().__init__(reads, hidden, propagation, samples_needed, resolution, name)
         listed = tuple(branches) if isinstance(branches, Sequence) and not isinstance(branches, str) else ()
         if not all(isinstance(b, str) and b for b in listed) or len(set(listed)) < max(2, len(listed)):
             raise InputError(f"{self.name}: branches = {branches!r}; give two or more different names")
@@ -152,7 +155,7 @@ class BranchNetwork(LearnedModel):
                 f"{self.name}: happened[{row}] = {unknown[0]!r} is no branch{hint} Branches: {names(self.writes)}"
             )
         hot = np.array([[float(b == branch) for branch in self.writes] for b in happened])
-        scaling = Scaling.of(x), None
+        scaling = Scaling.of(x, self._resolutions), None
         frequency = (hot.sum(axis=0) + 1.0) / (len(hot) + len(self.writes))  # Laplace's: no branch is impossible
         learner = self._experience.learner.copied()
         with Progress(f"fitting {self.name}", progress) as bar:
@@ -176,7 +179,7 @@ class BranchNetwork(LearnedModel):
 
     @property
     def _settings(self) -> dict[str, Any]:
-        settings = "name", "reads", "hidden", "propagation", "samples_needed"
+        settings = "name", "reads", "hidden", "propagation", "samples_needed", "resolution"
         return {name: getattr(self, name) for name in settings} | {"branches": self.writes}
 
     @classmethod
@@ -191,7 +194,9 @@ class BranchNetwork(LearnedModel):
         return {"logits": (self._experience.learner, self._experience.memory)}
 
     def _resume(self, samples: int, networks: Mapping[str, tuple[Learner, Memory | None]]) -> None:
-        self._experience = BranchExperience(samples, *networks["logits"])
+        kept = self._experience
+        kept.samples = samples
+        kept.learner, kept.memory = networks["logits"]
 
 
 def _expected_softmax(logits: Mixture) -> ca.MX:

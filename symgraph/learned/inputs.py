@@ -39,6 +39,33 @@ def checked_count(value: Any, place: str) -> int:
     return int(value)
 
 
+def checked_resolution(given: Any, reads: Mapping[str, int], place: str) -> dict[str, list[float]]:
+    """Return {label: a number of at least 0 for each element}, for labels that are read.
+
+    Raises:
+        InputError: another label, a number or shape that does not fit.
+    """
+    if given is None:
+        return {}
+    if not isinstance(given, Mapping):
+        raise InputError(f"{place} = {given!r}; give {{label: smallest deviation that counts}}")
+    checked = {}
+    for label, value in given.items():
+        if label not in reads:
+            raise InputError(f"{place}: {label!r} is not read{did_you_mean(label, reads)} Reads: {names(reads)}")
+        try:
+            numbers = as_numbers(value, f"{place} of {label!r}")
+        except SlotError as error:
+            raise InputError(str(error)) from None
+        if numbers.shape not in ((), (reads[label],)) or not (np.isfinite(numbers) & (numbers >= 0)).all():
+            raise InputError(
+                f"{place} of {label!r} is {value!r}; give a number of at least 0, or one for each of its {reads[label]} "
+                f"elements"
+            )
+        checked[label] = np.broadcast_to(numbers, reads[label]).tolist()
+    return checked
+
+
 def checked_hidden(hidden: Any, place: str) -> tuple[int, ...]:
     """Return the units of the hidden layers; raise InputError naming the place otherwise."""
     if isinstance(hidden, str) or not isinstance(hidden, Sequence):

@@ -82,6 +82,8 @@ class StochasticNetwork(LearnedModel):
         error: "likelihood" (default): σ maximises the likelihood of errors on samples that were left out; "paper":
             the paper's asymmetric loss on errors of the training samples; "none": σ = 0.
         samples_needed: with fewer, plans that need the network explore.
+        resolution: {label: standard deviation, a number or one for each element} up to which an input is taken for a
+            constant that carries noise, of which nothing is learned; 0 where left out [units of the inputs].
         name: shown in messages and pictures.
 
     Raises:
@@ -99,9 +101,10 @@ class StochasticNetwork(LearnedModel):
         propagation: str = "auto",
         error: ErrorModel = "likelihood",
         samples_needed: int = 3,
+        resolution: Mapping[str, Any] | None = None,
         name: str = "network",
     ) -> None:
-        super().__init__(reads, hidden, propagation, samples_needed, name)
+        super().__init__(reads, hidden, propagation, samples_needed, resolution, name)
         self.writes = checked_sizes(writes, f"{self.name}: writes")
         self.error = checked_option(error, ERROR_MODELS, f"{self.name}: error")
         sizes = (sum(self.reads.values()), *self.hidden, sum(self.writes.values()))
@@ -172,7 +175,7 @@ class StochasticNetwork(LearnedModel):
         x = checked_rows(x, self._mean.sizes[0], f"{self.name}: x")
         y = checked_rows(y, self._mean.sizes[-1], f"{self.name}: y")
         checked_pair(x, y, self.name)
-        scaling = Scaling.of(x), Scaling.of(y)
+        scaling = Scaling.of(x, self._resolutions), Scaling.of(y)
         kept = self._experience
         mean_learner, error_learner, error = kept.mean_learner.copied(), kept.error_learner.copied(), kept.error
         with Progress(f"fitting {self.name}", progress) as bar:
@@ -291,7 +294,7 @@ class StochasticNetwork(LearnedModel):
 
     @property
     def _settings(self) -> dict[str, Any]:
-        settings = "name", "reads", "writes", "hidden", "propagation", "error", "samples_needed"
+        settings = "name", "reads", "writes", "hidden", "propagation", "error", "samples_needed", "resolution"
         return {name: getattr(self, name) for name in settings}
 
     @classmethod
@@ -309,7 +312,8 @@ class StochasticNetwork(LearnedModel):
         return {name: networks[name] for name in self._layout(self._settings).networks}
 
     def _resume(self, samples: int, networks: Mapping[str, tuple[Learner, Memory | None]]) -> None:
-        kept = self._experience = NetworkExperience(samples)
+        kept = self._experience
+        kept.samples = samples
         kept.mean_learner, kept.mean = networks["mean"]
         if "error" in networks:
             kept.error_learner, kept.error = networks["error"]

@@ -26,10 +26,10 @@ class Scaling:
     sd: Array
 
     @classmethod
-    def of(cls, samples: Array) -> Scaling:
-        """Return the scaling of samples (N, n)."""
+    def of(cls, samples: Array, resolution: Array | float = 0.0) -> Scaling:
+        """Return the scaling of samples (N, n), in which deviations up to the resolution (n,) are none."""
         mean, sd = samples.mean(axis=0), samples.std(axis=0)
-        constant = sd <= 1e-9 * np.abs(samples).max(axis=0, initial=0.0)
+        constant = sd <= np.maximum(resolution, 1e-9 * np.abs(samples).max(axis=0, initial=0.0))
         return cls(mean, np.where(constant, 0.0, sd))
 
     @property

@@ -1,0 +1,111 @@
+"""Schedule: which world for how many episodes, how much is explored, and what is given beside what is observed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from symgraph.errors import InputError
+
+
+class World(Protocol):
+    """What an on-line loop drives: a simulator or a robot."""
+
+    def reset(self, seed: int) -> Mapping[str, Any]:
+        """Begin an episode; return {label: value} of the states that are observed at the start node."""
+        ...
+
+    def execute(
+        self, node: str, actions: Mapping[str, Any], selections: Mapping[str, str]
+    ) -> Mapping[str, Mapping[str, Any]]:
+        """Do what leaves a node.
+
+        Returns:
+            {node reached: {label: value} observed on the way there}, one entry for each group that happened.
+
+        Raises:
+            Exception: it failed; what was observed until then is the exception's attribute `observed`, {label: value}.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of everything."""
+        ...
+
+
+@dataclass(frozen=True)
+class Exploration:
+    """How much is tried beside what is planned: falls linearly from the first episode to none.
+
+    Beside it, `solve` explores by itself while a model has too few samples.
+
+    Args:
+        choices: probability that an attempt's selections are drawn instead of planned, in the first episode.
+        noise: standard deviation of what is added to each action, as a share of its range, in the first episode.
+        episodes: after how many nothing is tried any more.
+
+    Raises:
+        InputError: a number outside its range.
+    """
+
+    choices: float = 0.5
+    noise: float = 0.05
+    episodes: int = 40
+
+    def __post_init__(self) -> None:
+        for name, most in (("choices", 1.0), ("noise", 1.0), ("episodes", math.inf)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= most:
+                raise InputError(f"Exploration: {name} = {value!r}; give a number from 0 to {most:g}")
+
+    def at(self, episode: int) -> tuple[float, float]:
+        """Return probability of drawn selections and standard deviation of the noise in an episode, from 0 on."""
+        share = max(0.0, 1.0 - episode / self.episodes) if self.episodes else 0.0
+        return self.choices * share, self.noise * share
+
+
+NO_EXPLORATION = Exploration(0.0, 0.0, 0)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A part of what is to be learned from: so many episodes in one world.
+
+    Args:
+        name: under which its episodes are stored.
+        world: where they happen, see `World`.
+        episodes: how many.
+        explore: how much is tried; counts the episodes of this stage.
+        given: {label: value} of states that the world does not observe, or a function of the stage's episode, from 0
+            on, that returns it: reward shaping gives, say, a bonus that ends after ten episodes.
+
+    Raises:
+        InputError: an argument that does not fit.
+    """
+
+    name: str
+    world: World
+    episodes: int
+    explore: Exploration = field(default_factory=Exploration)
+    given: Mapping[str, Any] | Callable[[int], Mapping[str, Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise InputError(f"Stage: name is {self.name!r}; give a non-empty string")
+        for method in ("reset", "execute", "close"):
+            if not callable(getattr(self.world, method, None)):
+                raise InputError(
+                    f"stage {self.name!r}: world is {self.world!r}, which has no method {method!r}; see World"
+                )
+        if isinstance(self.episodes, bool) or not isinstance(self.episodes, (int, np.integer)) or self.episodes < 1:
+            raise InputError(f"stage {self.name!r}: episodes = {self.episodes!r}; give a positive whole number")
+        if not isinstance(self.explore, Exploration):
+            raise InputError(f"stage {self.name!r}: explore is {self.explore!r}; give an Exploration")
+
+    def given_at(self, episode: int) -> Mapping[str, Any]:
+        """Return the states that are given in an episode of this stage."""
+        return self.given(episode) if callable(self.given) else self.given
