@@ -53,7 +53,7 @@ def write(path: str | os.PathLike[str], kind: str, document: Mapping[str, Any], 
         MissingExtraError: safetensors is not installed.
     """
     safetensors = _import_safetensors()
-    target = _checked_path(path)
+    target = checked_path(path)
     tensors = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     head = {"format": FORMAT, "version": VERSION, "kind": kind}
     text = json.dumps({**head, "digest": _digest(document, tensors), **document}, ensure_ascii=False)
@@ -67,12 +67,21 @@ def write(path: str | os.PathLike[str], kind: str, document: Mapping[str, Any], 
             f"{target}: {len(text)} characters of labels and {len(data)} bytes are more than such a file may hold "
             f"({MOST_HEADER} and {MOST_BYTES}); take shorter labels or fewer units"
         )
-    target = Path(os.path.realpath(target))  # a link stays a link
+    replace_file(target, lambda file: file.write(data))
+
+
+def replace_file(path: str | os.PathLike[str], fill: Callable[[BinaryIO], object]) -> None:
+    """Put a file in the place of another, or of none, once all that `fill` writes is on the disk.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    target = Path(os.path.realpath(checked_path(path)))  # a link stays a link
     part = target.with_name(f".symgraph-{secrets.token_hex(8)}.part")
     try:
         try:
             with part.open("xb") as file:
-                file.write(data)
+                fill(file)
                 file.flush()
                 os.fsync(file.fileno())  # the name must not be there before the bytes are
             part.replace(target)
@@ -81,8 +90,8 @@ def write(path: str | os.PathLike[str], kind: str, document: Mapping[str, Any], 
             raise
     except OSError as error:
         raise StorageError(
-            f"{target} cannot be written: {error.strerror}; give the path of a file in a folder that is there and may "
-            "be written to"
+            f"{target} cannot be written: {error.strerror or error}; give the path of a file in a folder that is there "
+            "and may be written to"
         ) from None
 
 
@@ -99,7 +108,7 @@ def read(path: str | os.PathLike[str], kind: str, expected: Callable[[Document],
         MissingExtraError: safetensors is not installed.
     """
     safetensors = _import_safetensors()
-    path = _checked_path(path)
+    path = checked_path(path)
     try:
         # Opening a pipe would wait for its other end, and a device may have no end.
         if not stat.S_ISREG(path.stat().st_mode):
@@ -228,7 +237,8 @@ def _digest(document: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]])
     return state.hexdigest()
 
 
-def _checked_path(path: Any) -> Path:
+def checked_path(path: Any) -> Path:
+    """Return a path; raise StorageError where it is none."""
     try:
         name = os.fspath(path)
         if isinstance(name, str) and os.fsencode(name) and "\0" not in name:
