@@ -28,7 +28,7 @@ def fitted_branches():
 
 def same(a, b):
     """A model that was loaded equals another in all that decides predictions and further fits."""
-    assert a._settings == b._settings
+    assert a.settings == b.settings
     assert a.samples == b.samples
     for p, q in zip(a.parameters, b.parameters, strict=True):
         np.testing.assert_array_equal(p.value, q.value)

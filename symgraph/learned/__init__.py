@@ -3,18 +3,25 @@
 from symgraph.learned.branches import BranchNetwork, BranchReport
 from symgraph.learned.calibration import Calibration, PitHistogram, Scores, calibrate
 from symgraph.learned.episodes import Episode, EpisodeStore, Visit
+from symgraph.learned.loop import EpisodeReport, OnlineLoop
 from symgraph.learned.network import FitReport, StochasticNetwork
+from symgraph.learned.schedule import Exploration, Stage, World
 
 __all__ = [
     "BranchNetwork",
     "BranchReport",
     "Calibration",
     "Episode",
+    "EpisodeReport",
     "EpisodeStore",
+    "Exploration",
     "FitReport",
+    "OnlineLoop",
     "PitHistogram",
     "Scores",
+    "Stage",
     "StochasticNetwork",
     "Visit",
+    "World",
     "calibrate",
 ]

@@ -113,8 +113,8 @@ class LearnedModel(ABC):
             StorageError: the file cannot be written.
             MissingExtraError: safetensors is not installed.
         """
-        stored = snapshot.Stored(self._settings, self.samples, [p.value for p in self.parameters], self._networks)
-        document, arrays = snapshot.pack(stored, self._layout(self._settings))
+        stored = snapshot.Stored(self.settings, self.samples, [p.value for p in self.parameters], self._networks)
+        document, arrays = snapshot.pack(stored, self._layout(self.settings))
         storage.write(path, type(self).__name__, document, arrays)
 
     @classmethod
@@ -144,7 +144,7 @@ class LearnedModel(ABC):
             MissingExtraError: safetensors is not installed.
         """
         saved = type(self).load(path)
-        here, there = self._settings, saved._settings
+        here, there = self.settings, saved.settings
         other = [name for name in here if here[name] != there[name]]
         if other:
             raise StorageError(
@@ -167,7 +167,7 @@ class LearnedModel(ABC):
 
     @property
     @abstractmethod
-    def _settings(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, Any]:
         """All arguments that make such a model."""
 
     @classmethod

@@ -178,7 +178,7 @@ class BranchNetwork(LearnedModel):
         return BranchReport(len(x), plan.warm, trained.steps, trained.loss, time.perf_counter() - begin)
 
     @property
-    def _settings(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, Any]:
         settings = "name", "reads", "hidden", "propagation", "samples_needed", "resolution"
         return {name: getattr(self, name) for name in settings} | {"branches": self.writes}
 

@@ -59,8 +59,8 @@ def checked_resolution(given: Any, reads: Mapping[str, int], place: str) -> dict
             raise InputError(str(error)) from None
         if numbers.shape not in ((), (reads[label],)) or not (np.isfinite(numbers) & (numbers >= 0)).all():
             raise InputError(
-                f"{place} of {label!r} is {value!r}; give a number of at least 0, or one for each of its {reads[label]} "
-                f"elements"
+                f"{place} of {label!r} is {value!r}; give a number of at least 0, or one for each of its "
+                f"{reads[label]} elements"
             )
         checked[label] = np.broadcast_to(numbers, reads[label]).tolist()
     return checked

@@ -293,7 +293,7 @@ class StochasticNetwork(LearnedModel):
         return self._built[key]
 
     @property
-    def _settings(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, Any]:
         settings = "name", "reads", "writes", "hidden", "propagation", "error", "samples_needed", "resolution"
         return {name: getattr(self, name) for name in settings}
 
@@ -309,7 +309,7 @@ class StochasticNetwork(LearnedModel):
     def _networks(self) -> dict[str, tuple[Learner, Memory | None]]:
         kept = self._experience
         networks = {"mean": (kept.mean_learner, kept.mean), "error": (kept.error_learner, kept.error)}
-        return {name: networks[name] for name in self._layout(self._settings).networks}
+        return {name: networks[name] for name in self._layout(self.settings).networks}
 
     def _resume(self, samples: int, networks: Mapping[str, tuple[Learner, Memory | None]]) -> None:
         kept = self._experience

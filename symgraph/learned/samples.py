@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import re
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from symgraph.binding import BoundModel
 from symgraph.errors import InputError, names
-from symgraph.graph import Branch, Graph, Group
+from symgraph.graph import Graph
 from symgraph.learned.branches import BranchNetwork
-from symgraph.slots import Array, Selection
-
-Known = Mapping[str, Any]  # label → number, array, or the choice of a selection
+from symgraph.learned.knowledge import Knowledge, Known, branch_to, column_of
+from symgraph.learned.records import Visit
+from symgraph.slots import Array
 
 
 @dataclass(eq=False)
@@ -31,21 +34,30 @@ class Lesson:
     x: list[Array] = field(default_factory=list)
     y: list[Any] = field(default_factory=list)
 
+    def fit(self, seed: int) -> None:
+        """Fit the model to all samples."""
+        y = self.y if isinstance(self.model, BranchNetwork) else np.array(self.y)
+        self.model.fit(np.array(self.x), y, seed=seed, progress=False)
+
 
 class Lessons:
-    """The learned models of a graph, and what each can learn from a step of an episode.
+    """The learned models of a graph, what each can learn from the steps of episodes, and the files they are kept in.
 
     Args:
         graph: the task.
         limits: {label: (low, high)} that written values are clipped to before they are learned from.
+        folder: of the files `<name>.safetensors`.
+        seed: of the fits.
 
     Raises:
         InputError: two models of the same name, limits of what is no state.
     """
 
-    def __init__(self, graph: Graph, limits: Mapping[str, tuple[float, float]]) -> None:
+    def __init__(self, graph: Graph, limits: Mapping[str, tuple[float, float]], folder: Path, seed: int) -> None:
         self._graph = graph
         self._limits = dict(limits)
+        self._folder = folder
+        self._seed = seed
         self.all: dict[str, Lesson] = {}  # by the model's name
         for label in limits:
             if label not in graph.states():
@@ -58,18 +70,45 @@ class Lessons:
             if known.model.parameters[0] is not model.parameters[0]:  # a view under another rule shares its weights
                 raise InputError(f"two learned models are named {model.name!r}; give each a name of its own")
 
-    def take(self, node: str, before: Known, target: str, after: Known) -> list[Lesson]:
-        """Add what a step has to teach; return the lessons that have grown.
+    def restore(self) -> None:
+        """Take over the models that the folder holds."""
+        for name, lesson in self.all.items():
+            if self.file_of(name).exists():
+                lesson.model.restore(self.file_of(name))
+
+    def fit(self, lessons: Iterable[Lesson]) -> None:
+        """Fit the models that have not seen all of their samples, and keep each in its file."""
+        for lesson in lessons:
+            name, count = lesson.model.name, len(lesson.x)
+            if lesson.model.samples < count:
+                lesson.fit(zlib.crc32(repr((self._seed, name, count)).encode()))
+                lesson.model.save(self.file_of(name))
+
+    def file_of(self, name: str) -> Path:
+        """Return the file in which the model of this name is kept."""
+        return self._folder / f"{re.sub(r'[^A-Za-z0-9_+.-]', '_', name)}.safetensors"
+
+    def take(self, visits: Sequence[Visit], new: Sequence[Visit], knowledge: Knowledge) -> list[Lesson]:
+        """Add what new visits of an episode have to teach; return the lessons that have grown, each once.
 
         Args:
-            node: where the step began.
-            before: all that was known there, with the actions and selections of the step.
-            target: the node that it led to.
-            after: all that is known there.
+            visits: of the episode so far, by their steps.
+            new: those to learn from.
+            knowledge: of the episode.
 
         Raises:
             InputError: something that a model learns from was not observed.
         """
+        grown: dict[int, Lesson] = {}
+        for visit in new:
+            if visit.parent is not None:
+                before, after = knowledge.at[visit.parent], knowledge.at[visit.step]
+                for lesson in self._take(visits[visit.parent].node, before, visit.node, after):
+                    grown[id(lesson)] = lesson
+        return list(grown.values())
+
+    def _take(self, node: str, before: Known, target: str, after: Known) -> list[Lesson]:
+        """Add what the step from one node to another has to teach; return the lessons that have grown."""
         grown = []
         found = branch_to(self._graph, node, target, before)
         if found is None:  # the world leads back to an earlier node: no edge of the graph
@@ -100,33 +139,7 @@ class Lessons:
     def _column(self, bound: BoundModel, label: str, known: Known, what: str) -> Array:
         if label not in known:
             raise InputError(f"{bound.place} {what} {label!r}, which was not observed; known are {names(known)}")
-        slot = self._graph.slots[label]
-        if isinstance(slot, Selection):
-            return np.array([float(choice == known[label]) for choice in slot.choices])
-        return np.atleast_1d(np.asarray(known[label], dtype=float))
-
-
-def fit(lesson: Lesson, seed: int) -> None:
-    """Fit a model to all of its samples."""
-    y = lesson.y if isinstance(lesson.model, BranchNetwork) else np.array(lesson.y)
-    lesson.model.fit(np.array(lesson.x), y, seed=seed, progress=False)
-
-
-def branch_to(graph: Graph, node: str, target: str, known: Known) -> tuple[Group, Branch] | None:
-    """Return the branch that led from a node to another, and its group; None if the graph has none."""
-    found = [
-        (group, branch)
-        for group in graph.groups.get(node, ())
-        for branch in group.branches
-        if branch.target == target and (group.kind != "choose" or branch.label == known.get(str(group.selection)))
-    ]
-    if len(found) > 1 and any(model is not None for model in (b.model and b.model.learner for _, b in found)):
-        labels = names(branch.label for _, branch in found)
-        raise InputError(
-            f"node {node!r}: {labels} all lead to {target!r}, so that nobody can tell which one was learned from; "
-            f"give each a node of its own"
-        )
-    return found[0] if found else None
+        return column_of(self._graph, label, known[label])
 
 
 def _bound_models(graph: Graph) -> Iterable[BoundModel]:

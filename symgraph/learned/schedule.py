@@ -68,9 +68,6 @@ class Exploration:
         return self.choices * share, self.noise * share
 
 
-NO_EXPLORATION = Exploration(0.0, 0.0, 0)
-
-
 @dataclass(frozen=True)
 class Stage:
     """A part of what is to be learned from: so many episodes in one world.

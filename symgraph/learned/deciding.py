@@ -1,0 +1,173 @@
+"""Deciding: plans at the nodes where decisions are made, with what is tried beside them."""
+
+from __future__ import annotations
+
+import time
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from symgraph.graph import Graph
+from symgraph.learned.execution import Decision
+from symgraph.learned.knowledge import Knowledge
+from symgraph.learned.records import Visit
+from symgraph.objective import Objective
+from symgraph.optimizers.problem import Optimizer
+from symgraph.plan import Plan
+from symgraph.planner import solve
+from symgraph.slots import Action
+
+Notes = dict[str, Any]  # what is stored of a plan
+
+
+@dataclass(frozen=True)
+class Planning:
+    """How decisions are made, in all episodes of a loop.
+
+    Attributes:
+        graph: the task.
+        objectives: of the nodes at which is planned.
+        optimizer: of the plans, `solve`'s default if None.
+        again: a node at which the graph ends but from which the world may lead back to an earlier one.
+        attempts: how often the graph is gone through, at most.
+        seed: of all that is random.
+    """
+
+    graph: Graph
+    objectives: Mapping[str, Objective]
+    optimizer: Optimizer | None
+    again: str | None
+    attempts: int
+    seed: int
+
+
+class Decider:
+    """Decides in one episode.
+
+    Args:
+        planning: how.
+        knowledge: what is known in this episode.
+        number: of the episode.
+        tried: probability that an attempt's selections are drawn, and standard deviation of what is added to actions,
+            in ranges.
+        starts: decisions of other episodes, to start searches from.
+        recalled: {step: notes} of plans that were made before.
+        note: called with the step and the notes of every new plan.
+
+    Attributes:
+        decision: the latest.
+        notes: of the latest plan.
+        attempts: begun so far.
+        seconds: that planning took [s].
+    """
+
+    def __init__(
+        self,
+        planning: Planning,
+        knowledge: Knowledge,
+        number: int,
+        tried: tuple[float, float],
+        starts: Sequence[Mapping[str, Any]] = (),
+        recalled: Mapping[int, Notes] | None = None,
+        note: Callable[[int, Notes], None] = lambda step, notes: None,
+    ) -> None:
+        self._planning = planning
+        self._knowledge = knowledge
+        self._number = number
+        self._choices, self._noise = tried
+        self._starts = list(starts)
+        self._recalled = recalled or {}
+        self._note = note
+        self._fixed: dict[str, str] = {}
+        self._disturbance: dict[str, Any] = {}
+        self.decision: Decision = {}, {}
+        self.notes: Notes = {}
+        self.attempts = 0
+        self.seconds = 0.0
+
+    def goes_on(self, visit: Visit) -> bool:
+        """Whether the world is asked to leave a visit's node."""
+        if any(group.kind != "reward" for group in self._planning.graph.groups.get(visit.node, ())):
+            return True
+        return visit.node == self._planning.again and self.attempts < self._planning.attempts
+
+    def decide(self, visit: Visit) -> Decision:
+        """Return the actions and selections with which a visit's node is left."""
+        first = visit.parent is None or visit.node == self._planning.again
+        if first and visit.node in self._planning.objectives:
+            self._begin_attempt()
+        if visit.node in self._planning.objectives:
+            begin = time.perf_counter()
+            if visit.step in self._recalled:
+                self.notes = self._recalled[visit.step]
+            else:
+                self.notes = self._planned(visit)
+                self._note(visit.step, self.notes)
+            actions = {k: np.array(v) if isinstance(v, list) else v for k, v in self.notes["actions"].items()}
+            self.decision = actions, dict(self.notes["selections"])
+            self.seconds += time.perf_counter() - begin
+        return self.decision
+
+    def _begin_attempt(self) -> None:
+        """Draw what is tried in an attempt, all of whose decisions keep to it."""
+        graph = self._planning.graph
+        rng = np.random.default_rng([self._planning.seed, self._number, self.attempts])
+        self.attempts += 1
+        draws = rng.random() < self._choices
+        drawn = {label: str(rng.choice(slot.choices)) for label, slot in graph.selections().items()}
+        self._fixed = drawn if draws else {}
+        self._disturbance = {
+            label: self._noise * rng.standard_normal(slot.size) * (slot.upper - slot.lower)
+            for label, slot in graph.actions().items()
+        }
+
+    def _planned(self, visit: Visit) -> Notes:
+        """Plan at a visit's node, and return what is decided and expected."""
+        graph, objective = self._planning.graph, self._planning.objectives[visit.node]
+        known = self._knowledge.at[visit.step]
+        actions, selections = self.decision
+        plan = solve(
+            objective,
+            {label: known[label] for label in graph.states() if label in known},
+            self._planning.optimizer,
+            guess=[*([{**actions, **selections}] if actions or selections else []), *self._starts],
+            fixed=self._fixed,
+            seed=zlib.crc32(repr((self._planning.seed, self._number, visit.step)).encode()),
+            progress=False,
+        )
+        explores = plan.status.startswith("exploring")
+        ahead = {label for model in objective.tree.models for label in model.reads}
+        decided = {
+            label: value if explores else self._disturbed(label, value)
+            for label, value in plan.actions.items()
+            if label in ahead or label not in actions  # what lies behind stays as it was
+        }
+        drawn = f"drawn: {', '.join(self._fixed)}" if self._fixed else ""
+        return {
+            "actions": {**actions, **decided},
+            "selections": {**selections, **plan.selections},
+            "planned": plan.actions,
+            "value": plan.value,
+            "status": plan.status,
+            "explored": plan.status if explores else drawn,
+            "expected": _expected(plan),
+        }
+
+    def _disturbed(self, label: str, value: Any) -> Any:
+        slot = self._planning.graph.slots[label]
+        if not self._noise or not isinstance(slot, Action):
+            return value
+        column = np.clip(value + self._disturbance[label], slot.lower, slot.upper)
+        return float(column[0]) if slot.size == 1 else column
+
+
+def _expected(plan: Plan) -> dict[str, Any]:
+    """Return {label: mean} of the states on the way that the plan thinks most likely, later nodes over earlier ones."""
+    expected: dict[str, Any] = {}
+    for node in plan.nodes:
+        if node.probability > 0.5:
+            expected |= {label: gaussian.mean for label, gaussian in node.states.items()}
+    return expected

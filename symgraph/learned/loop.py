@@ -1,0 +1,333 @@
+"""The on-line loop: plan, execute edge by edge, store, fit what was executed, and again."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from symgraph.errors import InputError, did_you_mean, names
+from symgraph.graph import Graph
+from symgraph.learned.deciding import Decider, Notes, Planning
+from symgraph.learned.episodes import EpisodeStore
+from symgraph.learned.execution import Diverged, Execution, WorldFailed
+from symgraph.learned.knowledge import Knowledge, Known
+from symgraph.learned.records import Visit
+from symgraph.learned.samples import Lessons
+from symgraph.learned.schedule import Stage, World
+from symgraph.objective import Objective
+from symgraph.optimizers.problem import Optimizer
+from symgraph.outcomes import ModelNumbers
+from symgraph.tree import unroll
+
+STORE = "episodes.sqlite"  # in the folder of a loop
+
+
+@dataclass(frozen=True)
+class EpisodeReport:
+    """What happened in an episode.
+
+    Attributes:
+        number: counted from 0.
+        setup: the name of its stage.
+        seed: that the world was reset with.
+        status: "done", "failed" or "interrupted".
+        reason: why it failed, else empty.
+        total: the return, the sum of its rewards.
+        attempts: how often the graph was gone through.
+        actions: {label: value} decided last.
+        selections: {label: choice} decided last.
+        expected: {label: mean} of what the last plan promised.
+        value: that the last plan promised.
+        explored: why the last decision was not the best plan, e.g. "drawn: skill"; empty if it was.
+        known: {label: value} of all that was observed, the latest.
+        seconds: {"simulating", "planning", "fitting": time} [s].
+    """
+
+    number: int
+    setup: str
+    seed: int
+    status: str
+    reason: str
+    total: float
+    attempts: int
+    actions: dict[str, Any]
+    selections: dict[str, str]
+    expected: dict[str, Any]
+    value: float
+    explored: str
+    known: Known
+    seconds: dict[str, float]
+
+    def __str__(self) -> str:
+        chosen = ", ".join(f"{label} = {choice}" for label, choice in self.selections.items())
+        parts = [f"{self.setup} {self.number}", chosen, f"return {self.total:.3g}", self.explored]
+        parts += ["" if self.status == "done" else f"{self.status}: {self.reason}"]
+        return "; ".join(part for part in parts if part)
+
+
+class OnlineLoop:
+    """Learn a task by doing it: plan, execute, store, re-fit the models whose edge ran, and again.
+
+    Everything is kept in a folder as it happens: the episodes in `episodes.sqlite`, an `EpisodeStore`, and the learned
+    models as `<name>.safetensors`. A loop that is made anew with the same arguments goes on where the last one was
+    stopped or killed, and ends as that one would have, if its worlds do the same again for the same seed. If they do
+    not, as robots, the episode that was under way counts as interrupted, and what it had observed is learned from.
+
+    Args:
+        graph: the task; the models in it that can be fitted are learned.
+        stages: which worlds, for how many episodes, see `Stage`.
+        folder: of the files; made if it is not there.
+        decisions: nodes at which is planned anew, beside the graph's start.
+        again: a node at which the graph ends but from which the world may lead back to an earlier one.
+        attempts: how often the graph is gone through in an episode, at most.
+        optimizer: of the plans, `solve`'s default if left out.
+        limits: {label: (low, high)}: values beyond are clipped before they are learned from; rare accidents would
+            otherwise dominate a fit.
+        remembered: how many start points of a plan come from the better half of the past episodes.
+        seed: of all that is random.
+
+    Raises:
+        InputError: an argument that does not fit, or a folder whose episodes come from other arguments.
+        StorageError: a file that cannot be read or written.
+
+    Source: Yamaguchi & Atkeson, Humanoids 2016, section VII-A.
+    """
+
+    def __init__(
+        self,
+        graph: Graph,
+        stages: Sequence[Stage],
+        folder: str | os.PathLike[str],
+        *,
+        decisions: Collection[str] = (),
+        again: str | None = None,
+        attempts: int = 1,
+        optimizer: Optimizer | None = None,
+        limits: Mapping[str, tuple[float, float]] | None = None,
+        remembered: int = 4,
+        seed: int = 0,
+    ) -> None:
+        if isinstance(stages, Stage) or not stages or not all(isinstance(stage, Stage) for stage in stages):
+            raise InputError(f"stages = {stages!r}; give a list of Stage")
+        self.graph = graph
+        self.stages = tuple(stages)
+        self.folder = Path(folder)
+        self.decisions = tuple(dict.fromkeys((graph.start, *decisions)))
+        for node in (*self.decisions, *([] if again is None else [again])):
+            if node not in graph.nodes:
+                raise InputError(
+                    f"{node!r} is no node of the graph{did_you_mean(node, graph.nodes)} Nodes: {names(graph.nodes)}"
+                )
+        self._remembered = remembered
+        self._models = ModelNumbers()
+        self._planning = Planning(
+            graph,
+            {node: Objective(unroll(graph, start=node)) for node in self.decisions},
+            optimizer,
+            again,
+            attempts,
+            seed,
+        )
+        self._lessons = Lessons(graph, limits or {}, self.folder, seed)
+        self._past: list[tuple[float, dict[str, Any]]] = []  # return and last decision of each past episode
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.store = EpisodeStore(self.folder / STORE)
+        try:
+            self.store.set_settings(self.settings)
+            self._recall()
+        except BaseException:
+            self.store.close()
+            raise
+
+    @property
+    def episodes(self) -> int:
+        """How many episodes the stages have together."""
+        return sum(stage.episodes for stage in self.stages)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the episodes depend on, beside the worlds."""
+        return {
+            "slots": {label: repr(slot) for label, slot in self.graph.slots.items()},
+            "nodes": self.graph.nodes,
+            "learned": {name: lesson.model.settings for name, lesson in self._lessons.all.items()},
+            "decisions": list(self.decisions),
+            "again": self._planning.again,
+            "attempts": self._planning.attempts,
+            "remembered": self._remembered,
+            "seed": self._planning.seed,
+        }
+
+    def __iter__(self) -> Iterator[EpisodeReport]:
+        """Run the episodes that are still to come, with a report after each."""
+        while (number := self._next()) < self.episodes:
+            yield self._learn(number)
+
+    def perform(self, world: World, seed: int, given: Mapping[str, Any] | None = None) -> EpisodeReport:
+        """Run an episode with the best plans; nothing is tried, learned or stored.
+
+        Args:
+            world: where.
+            seed: of the world.
+            given: {label: value} of states that it does not observe.
+        """
+        knowledge = self._knowledge()
+        decider = Decider(self._planning, knowledge, 0, (0.0, 0.0), self._starts(0))
+        execution = Execution(self.graph, world, knowledge, 0)
+        status, reason = "done", ""
+        try:
+            execution.run(seed, given or {}, decider.decide, lambda visits, new: None, decider.goes_on)
+        except WorldFailed as failure:
+            status, reason = "failed", str(failure)
+        return _report(
+            0, "performed", seed, status, reason, execution.visits, knowledge, decider, execution.seconds, 0.0
+        )
+
+    def close(self) -> None:
+        """Close the store."""
+        self.store.close()
+
+    def __enter__(self) -> OnlineLoop:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _next(self) -> int:
+        """Return the number of the episode that is to be run, or gone on with."""
+        told = self.store.episodes()
+        return next((episode.number for episode in told if episode.status == "running"), len(told))
+
+    def _learn(self, number: int) -> EpisodeReport:
+        """Run an episode, or go on with it, and learn from it."""
+        stage, within = self._stage_of(number)
+        (seed,) = np.random.SeedSequence([self._planning.seed, number]).generate_state(1).tolist()
+        past, plans = self.store.visits(number), self.store.plans(number)
+        knowledge = self._knowledge()
+        execution = Execution(self.graph, stage.world, knowledge, number, past)
+        decider = Decider(
+            self._planning,
+            knowledge,
+            number,
+            stage.explore.at(within),
+            self._starts(number),
+            plans,
+            lambda step, notes: self.store.note_plan(number, step, notes),
+        )
+        fitting = 0.0
+
+        def reached(visits: list[Visit], new: bool) -> None:
+            nonlocal fitting
+            if new and visits[0].parent is None:
+                first = visits[0]
+                self.store.begin(number, stage.name, seed, first.observed, first.reward, node=first.node)
+            elif new:
+                self.store.add(visits)
+            begin = time.perf_counter()
+            self._lessons.fit(self._lessons.take(execution.visits, visits, knowledge))
+            fitting += time.perf_counter() - begin
+
+        status, reason, visits = "done", "", execution.visits
+        observed: dict[str, Any] | None = None
+        try:
+            execution.run(seed, stage.given_at(within), decider.decide, reached, decider.goes_on)
+        except Diverged as error:
+            status, reason = "interrupted", str(error)
+            knowledge, gone_through, visits = self._knowledge(), len(visits), past
+            knowledge.take_over(past)
+            self._lessons.fit(self._lessons.take(past, past[gone_through:], knowledge))
+        except WorldFailed as failure:
+            if failure.observed is None or not visits:  # a mistake in a program, for all anybody knows
+                raise (failure.__cause__ or failure) from None
+            status, reason, observed = "failed", str(failure), failure.observed
+        report = _report(
+            number, stage.name, seed, status, reason, visits, knowledge, decider, execution.seconds, fitting
+        )
+        info = {name: getattr(report, name) for name in ("attempts", "selections", "value", "explored")}
+        if observed is not None:
+            info["observed"] = observed
+        self.store.end(number, status, total=report.total, reason=reason, seconds=report.seconds, info=info)
+        self._remember(report.total, decider.notes)
+        return report
+
+    def _recall(self) -> None:
+        """Take over what the folder holds."""
+        self._lessons.restore()
+        for episode in self.store.episodes():
+            stage = self._stage_of(episode.number)[0] if episode.number < self.episodes else None
+            if stage is None or stage.name != episode.setup:
+                wanted = "no such episode" if stage is None else f"stage {stage.name!r} there"
+                raise InputError(
+                    f"{self.folder / STORE}: episode {episode.number} is of stage {episode.setup!r}, but the stages "
+                    f"have {wanted}; give those it was made with, or another folder"
+                )
+            if episode.status == "running":  # is gone through again, and learned from, when the loop runs
+                continue
+            visits, plans = self.store.visits(episode.number), self.store.plans(episode.number)
+            knowledge = self._knowledge()
+            knowledge.take_over(visits)
+            self._lessons.take(visits, visits, knowledge)
+            if episode.total is not None:
+                self._remember(episode.total, plans[max(plans)] if plans else {})
+        self._lessons.fit(self._lessons.all.values())
+
+    def _stage_of(self, number: int) -> tuple[Stage, int]:
+        """Return the stage of an episode and its place in it."""
+        for stage in self.stages:
+            if number < stage.episodes:
+                return stage, number
+            number -= stage.episodes
+        raise InputError(f"the stages have {self.episodes} episodes only")
+
+    def _knowledge(self) -> Knowledge:
+        return Knowledge(self.graph, self._models, self.decisions)
+
+    def _remember(self, total: float, notes: Notes) -> None:
+        if notes:
+            self._past.append((total, {**notes["actions"], **notes["selections"]}))
+
+    def _starts(self, number: int) -> list[dict[str, Any]]:
+        """Draw start points from the better half of the past episodes."""
+        better = sorted(self._past, key=lambda one: -one[0])[: (len(self._past) + 1) // 2]
+        rng = np.random.default_rng([self._planning.seed, number])
+        return [better[i][1] for i in rng.permutation(len(better))[: self._remembered]]
+
+
+def _report(
+    number: int,
+    setup: str,
+    seed: int,
+    status: str,
+    reason: str,
+    visits: Sequence[Visit],
+    knowledge: Knowledge,
+    decider: Decider,
+    simulating: float,
+    fitting: float,
+) -> EpisodeReport:
+    known: Known = {}
+    for visit in visits:
+        known |= knowledge.at[visit.step]
+    actions, selections = decider.decision
+    return EpisodeReport(
+        number=number,
+        setup=setup,
+        seed=seed,
+        status=status,
+        reason=reason,
+        total=float(sum(visit.reward for visit in visits)),
+        attempts=decider.attempts,
+        actions=actions,
+        selections=selections,
+        expected=decider.notes.get("expected", {}),
+        value=decider.notes.get("value", float("nan")),
+        explored=decider.notes.get("explored", ""),
+        known=known,
+        seconds={"simulating": simulating, "planning": decider.seconds, "fitting": fitting},
+    )
