@@ -13,6 +13,7 @@ def test_an_episode_is_run_told_and_drawn(tmp_path):
     app.command()(command_line.main)
     picture = tmp_path / "strip.png"
     options = ["--material", "wat", "--mouth", "0.25", "--skill", "shake", "--pictures", str(picture)]
+    options += ["--receiver-size", "0.25", "0.4", "0.16"]
     result = CliRunner().invoke(app, options)
     assert result.exit_code == 0, result.output
     assert "trial stopped: target" in result.output
@@ -22,12 +23,17 @@ def test_an_episode_is_run_told_and_drawn(tmp_path):
 
 @pytest.mark.parametrize(
     ("option", "value", "words"),
-    [("--material", "oil", "oil"), ("--mouth", "0.3", "0.25"), ("--video", "pour.avi", ".mp4")],
+    [
+        ("--material", "oil", "oil"),
+        ("--mouth", "0.3", "0.25"),
+        ("--receiver-size", "0.3 0.4 0.05", "0.1"),
+        ("--video", "pour.avi", ".mp4"),
+    ],
 )
 def test_wrong_values_are_refused_before_anything_runs(option, value, words, monkeypatch):
     monkeypatch.setattr(command_line, "run_episode", None)
     app = typer.Typer()
     app.command()(command_line.main)
-    result = CliRunner().invoke(app, [option, value], env={"COLUMNS": "200"})
+    result = CliRunner().invoke(app, [option, *value.split()], env={"COLUMNS": "200"})
     assert result.exit_code == 2
     assert words in result.output
