@@ -13,12 +13,26 @@ def test_an_episode_is_run_told_and_drawn(tmp_path):
     app.command()(command_line.main)
     picture = tmp_path / "strip.png"
     options = ["--material", "wat", "--mouth", "0.25", "--skill", "shake", "--pictures", str(picture)]
-    options += ["--receiver-size", "0.25", "0.4", "0.16"]
     result = CliRunner().invoke(app, options)
     assert result.exit_code == 0, result.output
     assert "trial stopped: target" in result.output
     assert "leaked_particles: 0" in result.output
     assert imageio.imread(picture).shape == (480, 6 * 480, 3)
+
+
+def test_the_receiver_is_as_large_as_asked(monkeypatch):
+    sizes = []
+
+    def look(world, policy, seed, trials, begin):
+        sizes.append(world.reset(seed)["receiver_size"].tolist())
+        raise typer.Exit
+
+    monkeypatch.setattr(command_line, "run_episode", look)
+    app = typer.Typer()
+    app.command()(command_line.main)
+    for options in ([], ["--receiver-size", "0.25", "0.4", "0.16"]):
+        assert CliRunner().invoke(app, options).exit_code == 0
+    assert sizes == [[0.3, 0.4, 0.2], [0.25, 0.4, 0.16]]
 
 
 @pytest.mark.parametrize(
