@@ -12,7 +12,7 @@ import typer
 
 from sims.pouring.actions import ACTIONS, SKILLS
 from sims.pouring.episode import fixed_policy, run_episode
-from sims.pouring.geometry import MOUTH_RANGE
+from sims.pouring.geometry import MOUTH_RANGE, RECEIVER_SIZE, SIDE_RANGE
 from sims.pouring.materials import MATERIALS
 from sims.pouring.rendering import VIDEO_ENDINGS, Camera, Window, film, strip, viewer, write_picture, write_video
 from sims.pouring.world import PouringWorld
@@ -26,6 +26,9 @@ STILL_STEPS = 20  # the same where only a strip is asked for, since drawing take
 def main(
     material: MaterialName = MaterialName.bnc,
     mouth: Annotated[float, typer.Option(min=MOUTH_RANGE[0], max=MOUTH_RANGE[1])] = 0.23,
+    receiver_size: Annotated[
+        tuple[float, float, float], typer.Option(min=SIDE_RANGE[0], max=SIDE_RANGE[1], help="Length, width, height.")
+    ] = RECEIVER_SIZE,
     skill: Skill = Skill.tip,
     seed: int = 0,
     trials: Annotated[int, typer.Option(min=1, help="Attempts after which to stop.")] = 1,
@@ -40,7 +43,7 @@ def main(
     """Pour once or a few times with middling parameters."""
     if video and video.suffix not in VIDEO_ENDINGS:  # said now, not after the episode
         raise typer.BadParameter(f"--video: {str(video)!r} does not end in one of {list(VIDEO_ENDINGS)}")
-    world = PouringWorld(str(material), mouth)
+    world = PouringWorld(str(material), mouth, receiver_size=receiver_size)
     actions = {label: bounds.scale(0.4) for label, bounds in ACTIONS.items()}
     actions |= {"pour_position": (pour_x, pour_z), "shake_stroke": (0.06, -1.57)}
     policy = fixed_policy(actions, str(skill))

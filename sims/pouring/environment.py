@@ -18,7 +18,7 @@ from sims.pouring.simulation import SimulationFailed
 from sims.pouring.world import PouringWorld
 
 # What an agent sees before an attempt: label -> (size, lowest, highest); amounts are at most 0.55 poured and
-# 10 spilled.
+# 10 spilled. The size of the receiver is left out, because its corners tell it.
 SEEN = {
     "receiver_corners": (12, -5.0, 5.0),
     "position": (3, -5.0, 5.0),

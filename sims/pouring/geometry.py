@@ -27,10 +27,14 @@ MOUTH_RANGE = (0.11, 0.25)
 GRIP_RANGE = (0.05, 0.45)  # height of the middle of the gripper on the source for grasp ratios 0 and 1
 
 RECEIVER_SIZE = (0.3, 0.4, 0.2)  # outer length (x), width (y), height
+SIDE_RANGE = (0.1, 1.0)  # of each side of the receiver
 RECEIVER_WALL = 0.02
 
 CLEARANCE = 0.03  # between the source's walls and the receiver's
-HEAP = 0.12  # height inside the receiver below which the source would press on poured spheres
+# Height above the floor, inside the receiver, below which the source would press on poured spheres. It does not go
+# with the rim: 55 spheres lie in two layers, 0.1 high, in any receiver of 0.22 to 0.38 by 0.4. The bounds of the
+# actions keep the source above 0.137 there, at the bottom of a long stroke from the lowest pouring position.
+HEAP = 0.12
 
 
 @dataclass(frozen=True)
@@ -125,8 +129,9 @@ class Receiver:
     size: tuple[float, ...] = RECEIVER_SIZE
 
     def __post_init__(self) -> None:
-        if len(self.size) != 3 or not all(0.1 <= side <= 1.0 for side in self.size):
-            raise ValueError(f"receiver: size is {self.size!r}; give length, width, height from 0.1 to 1")
+        low, high = SIDE_RANGE
+        if len(self.size) != 3 or not all(low <= side <= high for side in self.size):
+            raise ValueError(f"receiver: size is {self.size!r}; give length, width, height from {low:g} to {high:g}")
 
     @property
     def rim(self) -> float:

@@ -12,13 +12,14 @@ Observation = dict[str, Value]
 
 
 def setting(behaviour: Behaviour, target: float) -> Observation:
-    """What is given with an episode: where the trials start, how much to pour, the mouth, the material."""
+    """What is given with an episode: where the trials start, how much to pour, containers and material."""
     simulation = behaviour.simulation
     return {
         "waypoint": behaviour.waypoint,
         "target": target,
         "mouth": simulation.source.mouth,
         "material": simulation.material.features,
+        "receiver_size": np.array(simulation.receiver.size),
     }
 
 

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 from sims.pouring import observation
 from sims.pouring.actions import SKILLS, Clamp, read_action
 from sims.pouring.behaviour import SPHERE_AMOUNT, Behaviour, BehaviourState, End, Phase
-from sims.pouring.geometry import MOUTH_RANGE, RECEIVER_SIZE, SPHERES, START, Receiver, Source
-from sims.pouring.materials import Material, find_material
+from sims.pouring.geometry import MOUTH_RANGE, RECEIVER_SIZE, SIDE_RANGE, SPHERES, START, Receiver, Source
+from sims.pouring.materials import Material, find_material, mix
 from sims.pouring.observation import Observation
 from sims.pouring.scene import CONTROL_STEP
 from sims.pouring.simulation import Simulation, SimulationFailed, SimulationState
@@ -32,6 +32,7 @@ class WorldState:
 
     material: Material
     mouth: float
+    receiver: Receiver
     target: float
     behaviour: BehaviourState
     clamps: tuple[Clamp, ...]
@@ -55,11 +56,13 @@ class PouringWorld:
         mouth: Width of the source's opening [length], or (low, high) from which every reset draws.
         target: Amount to pour, 0.0055 for each sphere, or (low, high) from which every reset draws.
         receiver_x: Where the receiver's centre stands [length], or (low, high) from which every reset draws.
-        receiver_size: Length, width and height of the receiver [length].
+        receiver_size: Length (x), width (y) and height of the receiver [length]; each is a number or (low, high)
+            from which every reset draws.
         time_limit: Simulated time after which no further trial begins.
+        blend: Whether every reset draws two different materials and a share, and pours the `mix` of them.
 
     Raises:
-        ValueError: A value lies outside its range.
+        ValueError: A value lies outside its range; there is nothing to blend.
 
     Attributes:
         clamps: Commands of this episode that could not be followed as given.
@@ -75,18 +78,24 @@ class PouringWorld:
         mouth: float | tuple[float, float] = 0.23,
         target: float | tuple[float, float] = 0.3,
         receiver_x: float | tuple[float, float] = RECEIVER_RANGE,
-        receiver_size: Sequence[float] = RECEIVER_SIZE,
+        receiver_size: Sequence[float | tuple[float, float]] = RECEIVER_SIZE,
         time_limit: float = 500.0,
+        blend: bool = False,
     ) -> None:
         if isinstance(material, str | Material):
             material = (material,)
         if len(material) == 0:
             raise ValueError("material: the sequence is empty; give at least one material")
         self._materials = tuple(find_material(one) for one in material)
+        if blend and len(set(self._materials)) < 2:
+            raise ValueError(f"blend: {material!r} has nothing to blend; give at least two different materials")
+        self._blend = blend
         self._mouth = _check_range("mouth", mouth, MOUTH_RANGE)
         self._target = _check_range("target", target, (0.0, SPHERES * SPHERE_AMOUNT))
         self._receiver_x = _check_range("receiver_x", receiver_x, RECEIVER_RANGE)
-        self._receiver = Receiver(tuple(receiver_size))
+        if len(receiver_size) != 3:
+            raise ValueError(f"receiver_size: {receiver_size!r} is not length, width, height; give three values")
+        self._receiver_size = tuple(_check_range("receiver_size", side, SIDE_RANGE) for side in receiver_size)
         self._time_limit = time_limit
         self._behaviour: Behaviour | None = None
         self.clamps: list[Clamp] = []
@@ -107,8 +116,15 @@ class PouringWorld:
         target = float(generator.uniform(*self._target))
         receiver_x = float(generator.uniform(*self._receiver_x))
         material = self._materials[int(generator.integers(len(self._materials)))]
-        settled = _settle(material, Source(mouth), self._receiver, receiver_x, seed)
-        self._begin(material, mouth, target, settled)
+        # How many numbers the choice of a material takes depends on how many there are; from a stream of their own
+        # these are the same whatever is drawn above.
+        generator = np.random.default_rng([seed, 2])
+        receiver = Receiver(tuple(float(generator.uniform(*side)) for side in self._receiver_size))
+        if self._blend:
+            others = [other for other in self._materials if other != material]
+            material = mix(material, others[int(generator.integers(len(others)))], float(generator.uniform()))
+        settled = _settle(material, Source(mouth), receiver, receiver_x, seed)
+        self._begin(material, mouth, receiver, target, settled)
         self.clamps, self.end = [], None
         return observation.setting(self.behaviour, target) | observation.situation(self.behaviour, target)
 
@@ -143,7 +159,8 @@ class PouringWorld:
                 observation.totals(behaviour) | observation.flow(behaviour) | observation.changes(behaviour)
             )
             raise
-        if behaviour.simulation.lifted > 0.0:
+        # The first way to the waypoint is no command; where that is low, the floor raises the tilting source a little.
+        if behaviour.simulation.lifted > 0.0 and node != Phase.GRASPED.value:
             self.clamps.append(Clamp("lift", (0.0,), (behaviour.simulation.lifted,)))
         return reached
 
@@ -182,6 +199,7 @@ class PouringWorld:
         return WorldState(
             simulation.material,
             simulation.source.mouth,
+            simulation.receiver,
             self.behaviour.target,
             self.behaviour.save(),
             tuple(self.clamps),
@@ -189,13 +207,15 @@ class PouringWorld:
         )
 
     def restore(self, state: WorldState) -> None:
-        """Go on with an episode that this world, or one with the same receiver and time limit, has saved."""
-        self._begin(state.material, state.mouth, state.target, state.behaviour.simulation)
+        """Go on with an episode that this world, or one with the same time limit, has saved."""
+        self._begin(state.material, state.mouth, state.receiver, state.target, state.behaviour.simulation)
         self.behaviour.restore(state.behaviour)
         self.clamps, self.end = list(state.clamps), state.end
 
-    def _begin(self, material: Material, mouth: float, target: float, state: SimulationState) -> None:
-        simulation = Simulation(material, Source(mouth), self._receiver)
+    def _begin(
+        self, material: Material, mouth: float, receiver: Receiver, target: float, state: SimulationState
+    ) -> None:
+        simulation = Simulation(material, Source(mouth), receiver)
         simulation.restore(state)
         self._behaviour = Behaviour(simulation, target, self._time_limit)
 

@@ -10,8 +10,15 @@ from gymnasium.utils.env_checker import check_env
 from sims.pouring.environment import PouringEnv, reward_of
 
 
-def test_it_passes_the_official_checks_without_a_warning():
-    env = gymnasium.make("Pouring-v0", render_mode="rgb_array", material="wat", mouth=0.25).unwrapped
+@pytest.mark.parametrize(
+    "setup",
+    [
+        {"material": "wat", "mouth": 0.25},
+        {"target": (0.1, 0.4), "receiver_size": ((0.22, 0.38), 0.4, (0.14, 0.22)), "blend": True},
+    ],
+)
+def test_it_passes_the_official_checks_without_a_warning(setup):
+    env = gymnasium.make("Pouring-v0", render_mode="rgb_array", **setup).unwrapped
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env)

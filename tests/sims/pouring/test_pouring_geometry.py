@@ -64,6 +64,20 @@ def test_the_source_rises_over_rim_heap_and_floor_only_where_it_must():
     assert required_lift(outline, np.array([0.15, 0.4, 0.0]), receiver, 0.8) == pytest.approx(0.1)
 
 
+@pytest.mark.parametrize(("rim", "most"), [(0.14, 0.0), (0.2, 0.0), (0.22, 0.013)])
+def test_low_pouring_positions_clear_the_rim_of_any_receiver_or_nearly(rim, most):
+    """Where tipping pours best, 0.17 to 0.24 before the middle, from the lowest shoulder that may be asked for."""
+    lifts = [
+        required_lift(Source(mouth).outline(), np.array([x, 0.32, tilt]), Receiver((length, 0.4, rim)), 0.0)
+        for mouth in (0.11, 0.18, 0.25)
+        for length in (0.22, 0.3, 0.38)
+        for x in (-0.24, -0.2, -0.17)
+        for tilt in np.linspace(np.pi / 3, 0.9 * np.pi, 20)
+    ]
+    assert max(lifts) <= most
+    assert (max(lifts) > 0.0) == (most > 0.0)
+
+
 @pytest.mark.parametrize("mouth", [0.1, 0.26])
 def test_a_wrong_mouth_is_named(mouth):
     with pytest.raises(ValueError, match=r"give a number from 0.11 to 0.25"):

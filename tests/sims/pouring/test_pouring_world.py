@@ -8,9 +8,16 @@ import sys
 import numpy as np
 import pytest
 
-from sims.pouring import ACTIONS, End, Material, PouringWorld, SimulationFailed, behaviour
+from sims.pouring import ACTIONS, MATERIALS, End, Material, PouringWorld, SimulationFailed, behaviour
 from sims.pouring.behaviour import TRANSITIONS, Phase
 
+VARIED = {
+    "material": tuple(MATERIALS),
+    "mouth": (0.11, 0.25),
+    "target": (0.1, 0.4),
+    "receiver_size": ((0.22, 0.38), 0.4, (0.14, 0.22)),
+    "blend": True,
+}
 ACTION = {
     "grasp_ratio": 0.3,
     "pour_position": (-0.2, 0.33),
@@ -31,6 +38,7 @@ START_SIZES = {
     "target_change": 1,
     "mouth": 1,
     "material": 4,
+    "receiver_size": 3,
 }
 EDGE_SIZES = {
     "grasped": {"grasp_height": 1},
@@ -219,6 +227,11 @@ def test_an_unknown_skill_is_named():
         ({"target": (0.4, 0.2)}, "target"),
         ({"material": ()}, "give at least one material"),
         ({"receiver_x": 2.0}, "receiver_x"),
+        ({"receiver_size": (0.3, 0.4)}, "receiver_size: .0.3, 0.4. is not length, width, height; give three values"),
+        ({"receiver_size": (0.3, (0.4, 0.2), 0.2)}, "receiver_size: .0.4, 0.2. is not a number or .low, high."),
+        ({"receiver_size": (0.3, 0.4, (0.05, 0.2))}, "from 0.1 to 1"),
+        ({"material": "wat", "blend": True}, "blend: .'wat',. has nothing to blend; give at least two different"),
+        ({"material": ("wat", "wat"), "blend": True}, "nothing to blend"),
     ],
 )
 def test_wrong_arguments_are_named(arguments, words):
@@ -245,6 +258,70 @@ def test_resets_draw_what_is_not_fixed():
     fixed = PouringWorld("wat", (0.11, 0.25), 0.3).reset(3)
     assert fixed["mouth"] == starts[3]["mouth"]
     assert np.array_equal(fixed["receiver_corners"], starts[3]["receiver_corners"])
+
+
+@pytest.mark.parametrize("varied", [{}, {"receiver_size": VARIED["receiver_size"]}, {"blend": True}])
+def test_what_older_setups_draw_stays_as_it_was(varied):
+    """Episodes that were published by their seed must not change when a reset learns to draw more."""
+    names = ("wat", "vsc", "bnc")
+    world = PouringWorld(names, (0.11, 0.25), (0.2, 0.4), **varied)
+    for seed in range(4):
+        generator = np.random.default_rng(seed)  # one after the other, as before there was more to draw
+        mouth, target, x = (generator.uniform(low, high) for low, high in ((0.11, 0.25), (0.2, 0.4), (0.5, 1.1)))
+        material = MATERIALS[names[generator.integers(3)]]
+        start = world.reset(seed)
+        assert (start["mouth"], start["target"]) == (mouth, target)
+        assert start["receiver_corners"][0::3].mean() == pytest.approx(x, abs=1e-12)
+        if "receiver_size" not in varied:
+            assert start["receiver_size"].tolist() == [0.3, 0.4, 0.2]
+        if "blend" not in varied:
+            assert np.array_equal(start["material"], material.features)
+
+
+def test_resets_draw_a_receiver_and_what_is_observed_of_it_agrees():
+    world = PouringWorld(**VARIED)
+    starts = [world.reset(seed) for seed in range(6)]
+    sizes = np.array([start["receiver_size"] for start in starts])
+    assert len(set(sizes[:, 0])) == len(set(sizes[:, 2])) == 6
+    assert ((sizes >= [0.22, 0.4, 0.14]) & (sizes <= [0.38, 0.4, 0.22])).all()
+    for start, size in zip(starts, sizes, strict=True):
+        corners = start["receiver_corners"].reshape(4, 3)
+        assert np.ptp(corners[:, :2], axis=0) == pytest.approx(size[:2])
+        assert corners[:, 2] == pytest.approx(size[2])
+        assert start["waypoint"] == pytest.approx([corners[:, 0].mean() - 0.3, size[2] + 0.35])
+        assert 0.1 <= start["target"] == start["target_change"] <= 0.4
+    # What else is drawn, and how many there are to draw it from, changes neither the receiver nor the rest.
+    fixed = PouringWorld("wat", receiver_size=VARIED["receiver_size"]).reset(3)
+    assert np.array_equal(fixed["receiver_corners"], starts[3]["receiver_corners"])
+
+
+def test_a_blend_lies_between_two_different_materials():
+    names = tuple(MATERIALS)
+    pure, blended = PouringWorld(names), PouringWorld(names, blend=True)
+    shares, pairs = [], set()
+    for seed in range(12):
+        first, seen = pure.reset(seed)["material"], blended.reset(seed)["material"]
+        ways = {name: material.features - first for name, material in MATERIALS.items()}
+        ways = {name: way for name, way in ways.items() if way.any()}
+        found = {name: (seen - first) @ way / (way @ way) for name, way in ways.items()}
+        found = {name: share for name, share in found.items() if np.allclose(first + share * ways[name], seen)}
+        assert len(found) == 1
+        pairs.add((tuple(first), *found))
+        shares += found.values()
+    assert all(0.0 <= share <= 1.0 for share in shares)
+    assert max(shares) - min(shares) > 0.5
+    assert len(pairs) > 4
+
+
+def test_the_way_over_a_low_receiver_is_no_clamped_command():
+    world = PouringWorld("wat", 0.25, receiver_x=0.5, receiver_size=(0.3, 0.4, 0.14))
+    start = world.reset(0)
+    seen = advance(world, "at_receiver")["at_receiver"]
+    assert world.behaviour.simulation.lifted > 0.0  # the tilting source had to clear the floor
+    assert world.clamps == []
+    assert seen["position"] == pytest.approx([start["waypoint"][0], 0.0, start["waypoint"][1]], abs=0.005)
+    observed = world.execute("at_receiver", ACTION)["at_pour"]
+    assert observed["relative_position"] == pytest.approx([-0.2, 0.0, 0.33 - 0.14], abs=0.005)
 
 
 def test_a_failed_simulation_ends_the_episode_with_what_was_measured():
@@ -311,6 +388,22 @@ def test_an_episode_goes_on_from_a_saved_state(shaken):
     observed = advance(fresh, "poured")
     assert digest(fresh) == digest(other) == digest(world)
     assert observed["poured"]["poured_change"] == pytest.approx(0.0055 * world.behaviour.census.in_receiver)
+
+
+def test_a_varied_world_goes_back_to_the_receiver_that_it_saved():
+    world = PouringWorld(**VARIED)
+    start = world.reset(1)
+    advance(world, "ready")
+    saved = pickle.loads(pickle.dumps(world.save()))
+    poured = advance(world, "poured")
+    end = digest(world)
+    assert not np.array_equal(world.reset(2)["receiver_size"], start["receiver_size"])
+    for other in (world, PouringWorld("bnc", 0.12)):
+        other.restore(saved)
+        assert np.array_equal(other.behaviour.simulation.receiver.size, start["receiver_size"])
+        again = advance(other, "poured")
+        assert digest(other) == end
+        assert again["poured"] == poured["poured"]
 
 
 def test_physics_goes_on_from_a_state_saved_within_a_skill():
