@@ -345,10 +345,13 @@ os.chmod(f"{folder}/held", 0o444)
 os.mkdir(f"{folder}/closed", 0o555)
 EpisodeStore(f"{folder}/secret").close()
 os.chmod(f"{folder}/secret", 0)
+os.mkdir(f"{folder}/shelf")
+EpisodeStore(f"{folder}/shelf/run").close()
+os.chmod(f"{folder}/shelf", 0o555)
 os.chmod(folder, 0o755)
 if os.getuid() == 0:
     os.setuid(65534)  # root may do everything
-for name, read_only in (("held", False), ("closed/new", False), ("secret", True)):
+for name, read_only in (("held", False), ("closed/new", False), ("secret", True), ("shelf/run", True)):
     try: EpisodeStore(f"{folder}/{name}", read_only=read_only)
     except Exception as error: print(type(error).__name__, error)
 """
@@ -357,7 +360,8 @@ for name, read_only in (("held", False), ("closed/new", False), ("secret", True)
 def test_missing_permissions_are_named(tmp_path_factory):
     with tempfile.TemporaryDirectory() as folder:  # pytest's own is closed to other users
         said = output_of(script(FORBIDDEN, folder)).splitlines()
-        Path(folder, "closed").chmod(0o755)
+        for name in ("closed", "shelf"):
+            Path(folder, name).chmod(0o755)  # or their contents could not be removed
     assert said[0] == (
         f"StorageError {folder}/held may not be written to by this user; change its permissions, or open it with "
         "read_only=True"
@@ -366,6 +370,8 @@ def test_missing_permissions_are_named(tmp_path_factory):
         f"StorageError {folder}/closed/new: this user may not write to the folder {folder}/closed"
     )
     assert said[2] == f"StorageError {folder}/secret may not be read by this user; change its permissions"
+    assert said[3].startswith(f"StorageError {folder}/shelf/run: attempt to write a readonly database; SQLite's log")
+    assert said[3].endswith("copy it to a folder that may be written to")
 
 
 def test_a_full_disk_loses_the_transaction_and_no_more(store, path):

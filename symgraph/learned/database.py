@@ -270,6 +270,7 @@ class Database:
                 raise self.damaged(what) from error
             remedy = {
                 sqlite3.SQLITE_FULL: "make room on the disk; what was stored before is there",
+                sqlite3.SQLITE_READONLY: "SQLite's log stands beside it; copy it to a folder that may be written to",
                 sqlite3.SQLITE_TOOBIG: "store less in one piece",
                 sqlite3.SQLITE_BUSY: "another program holds it locked; end that one",
             }.get(kind, "look whether its folder is there and may be written to, for SQLite's log")
