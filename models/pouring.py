@@ -56,7 +56,7 @@ def move_to_receiver(receiver_corners: ca.MX, waypoint: ca.MX) -> dict[str, ca.M
     return {"receiver_corners": receiver_corners, "position": ca.vertcat(waypoint[0], 0, waypoint[1])}
 
 
-def move_receiver(receiver_corners: ca.MX) -> dict[str, ca.MX]:
+def move_receiver(receiver_corners: ca.MX) -> dict[str, Any]:
     """F_mv_to_rcv_rcvmv: how far, and how fast, the receiver is pushed on the way to it: not at all.
 
     Args:
@@ -65,7 +65,7 @@ def move_receiver(receiver_corners: ca.MX) -> dict[str, ca.MX]:
     Returns:
         receiver_corner_change: (12,) [length]; receiver_speed: () [length / time].
     """
-    return {"receiver_corner_change": 0 * receiver_corners, "receiver_speed": ca.MX(0)}
+    return {"receiver_corner_change": 0 * receiver_corners, "receiver_speed": 0.0}
 
 
 def move_to_pour(receiver_corners: ca.MX, pour_position: ca.MX) -> dict[str, ca.MX]:

@@ -44,7 +44,7 @@ LAYERS = [
     "learned",
 ]
 
-HEAVY = {"torch", "mujoco", "matplotlib", "scipy.optimize", "scipy.stats", "IPython", "pandas"}
+HEAVY = {"torch", "mujoco", "matplotlib", "pyarrow", "scipy.optimize", "scipy.stats", "IPython", "pandas"}
 
 
 def run(*command, cwd=ROOT, **variables):

@@ -29,7 +29,7 @@ COPY = "take another copy of the file, or save what can be read with  sqlite3 FI
 # Stores that are open, and process and kind of whoever opened them. POSIX locks do not keep out a process's own
 # second writer, and SQLite's own are lost to a child that was forked while a store was open.
 _open: dict[tuple[str, int, bool], int] = {}  # {(file, process, writes): how often}
-_guard = threading.Lock()
+_guard = threading.RLock()  # the garbage collector may close a store while one is being opened
 
 
 class Database:
@@ -90,7 +90,7 @@ class Database:
     def _check_place(self, file: str) -> None:
         """Raise StorageError where no such file can be; the message says what SQLite would not."""
         folder = Path(file).parent
-        for process in {process for name, process, _ in _open if name == file}:
+        for process in {process for name, process, _ in list(_open) if name == file}:
             if process != self._process:
                 raise StorageError(
                     f"{self.path} was open in process {process} when this one was forked from it, and SQLite does not "
@@ -270,6 +270,7 @@ class Database:
                 raise self.damaged(what) from error
             remedy = {
                 sqlite3.SQLITE_FULL: "make room on the disk; what was stored before is there",
+                sqlite3.SQLITE_READONLY: "SQLite's log stands beside it; copy it to a folder that may be written to",
                 sqlite3.SQLITE_TOOBIG: "store less in one piece",
                 sqlite3.SQLITE_BUSY: "another program holds it locked; end that one",
             }.get(kind, "look whether its folder is there and may be written to, for SQLite's log")

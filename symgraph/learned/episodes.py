@@ -123,8 +123,8 @@ class EpisodeStore:
         changed = [name for name in {**told, **asked} if told.get(name) != asked.get(name)]
         if changed:
             raise InputError(
-                f"{self._database.path} already has settings, with others for {names(changed)}; go on with those it has, "
-                "or give another path"
+                f"{self._database.path} already has settings, with others for {names(changed)}; go on with those it "
+                "has, or give another path"
             )
 
     def begin(

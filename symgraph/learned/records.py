@@ -27,7 +27,7 @@ LARGEST = (1 << 63) - 1  # of the whole numbers that SQLite holds
 class Visit:
     """One node that an episode reached.
 
-    Two visits are equal if all their numbers are, to the last bit; NaN equals NaN.
+    Two visits are equal if all their numbers are, to the last bit; every NaN equals every other.
 
     Args:
         episode: its number.
@@ -230,6 +230,10 @@ def json_of(given: Any, place: str) -> str:
         return json.dumps(_plain(given, place))
     except RecursionError:
         raise InputError(f"{place} is nested too deeply, or holds itself; leave that out") from None
+    except ValueError as error:  # Python refuses to write numbers of thousands of digits
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{place}: {error}; leave it out") from None
 
 
 def _plain(given: Any, place: str) -> Any:
@@ -292,11 +296,11 @@ def _items(given: Any, place: str, what: str) -> Iterable[tuple[str, Any]]:
 
 
 def _same(a: Any, b: Any) -> bool:
-    """Whether two fields of visits hold the same: 0.0 is not -0.0, and one element is not a scalar."""
+    """Whether two fields of visits hold the same: 0.0 is not -0.0, one element is not a scalar, NaN is NaN."""
     if isinstance(a, dict) and isinstance(b, dict):
         return a.keys() == b.keys() and all(_same(a[label], b[label]) for label in a)
     if isinstance(a, (float, np.ndarray)) and isinstance(b, (float, np.ndarray)):
         left, right = np.asarray(a), np.asarray(b)
         equal = np.array_equal(left, right, equal_nan=True)
-        return equal and np.array_equal(np.signbit(left), np.signbit(right))
+        return equal and bool(np.all((np.signbit(left) == np.signbit(right)) | np.isnan(left)))
     return bool(a == b)
