@@ -14,6 +14,7 @@ from symgraph.graph import Graph
 from symgraph.learned.execution import Decision
 from symgraph.learned.knowledge import Knowledge
 from symgraph.learned.records import Visit
+from symgraph.learned.schedule import Exploration
 from symgraph.objective import Objective
 from symgraph.optimizers.problem import Optimizer
 from symgraph.plan import Plan
@@ -51,8 +52,7 @@ class Decider:
         planning: how.
         knowledge: what is known in this episode.
         number: of the episode.
-        tried: probability that an attempt's selections are drawn, and standard deviation of what is added to actions,
-            in ranges.
+        explore: how much is tried in this episode.
         starts: decisions of other episodes, to start searches from.
         recalled: {step: notes} of plans that were made before.
         note: called with the step and the notes of every new plan.
@@ -69,7 +69,7 @@ class Decider:
         planning: Planning,
         knowledge: Knowledge,
         number: int,
-        tried: tuple[float, float],
+        explore: Exploration,
         starts: Sequence[Mapping[str, Any]] = (),
         recalled: Mapping[int, Notes] | None = None,
         note: Callable[[int, Notes], None] = lambda step, notes: None,
@@ -77,11 +77,11 @@ class Decider:
         self._planning = planning
         self._knowledge = knowledge
         self._number = number
-        self._choices, self._noise = tried
+        self._explore = explore
         self._starts = list(starts)
         self._recalled = recalled or {}
         self._note = note
-        self._fixed: dict[str, str] = {}
+        self._fixed: dict[str, Any] = {}
         self._disturbance: dict[str, Any] = {}
         self.decision: Decision = {}, {}
         self.notes: Notes = {}
@@ -116,11 +116,12 @@ class Decider:
         graph = self._planning.graph
         rng = np.random.default_rng([self._planning.seed, self._number, self.attempts])
         self.attempts += 1
-        draws = rng.random() < self._choices
-        drawn = {label: str(rng.choice(slot.choices)) for label, slot in graph.selections().items()}
-        self._fixed = drawn if draws else {}
+        draws_selections, draws_actions = rng.random(2) < (self._explore.selections, self._explore.actions)
+        selections = {label: str(rng.choice(slot.choices)) for label, slot in graph.selections().items()}
+        actions = {label: rng.uniform(slot.lower, slot.upper) for label, slot in graph.actions().items()}
+        self._fixed = {**(selections if draws_selections else {}), **(actions if draws_actions else {})}
         self._disturbance = {
-            label: self._noise * rng.standard_normal(slot.size) * (slot.upper - slot.lower)
+            label: self._explore.noise * rng.standard_normal(slot.size) * (slot.upper - slot.lower)
             for label, slot in graph.actions().items()
         }
 
@@ -145,20 +146,21 @@ class Decider:
             for label, value in plan.actions.items()
             if label in ahead or label not in actions  # what lies behind stays as it was
         }
-        drawn = f"drawn: {', '.join(self._fixed)}" if self._fixed else ""
+        kinds = {"selections": graph.selections(), "actions": graph.actions()}
+        drawn = [kind for kind, slots in kinds.items() if any(label in self._fixed for label in slots)]
         return {
             "actions": {**actions, **decided},
             "selections": {**selections, **plan.selections},
             "planned": plan.actions,
             "value": plan.value,
             "status": plan.status,
-            "explored": plan.status if explores else drawn,
+            "explored": plan.status if explores else f"drawn: {', '.join(drawn)}" if drawn else "",
             "expected": _expected(plan),
         }
 
     def _disturbed(self, label: str, value: Any) -> Any:
         slot = self._planning.graph.slots[label]
-        if not self._noise or not isinstance(slot, Action):
+        if label in self._fixed or not self._explore.noise or not isinstance(slot, Action):
             return value
         column = np.clip(value + self._disturbance[label], slot.lower, slot.upper)
         return float(column[0]) if slot.size == 1 else column

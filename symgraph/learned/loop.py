@@ -19,7 +19,7 @@ from symgraph.learned.execution import Diverged, Execution, WorldFailed
 from symgraph.learned.knowledge import Knowledge, Known
 from symgraph.learned.records import Visit
 from symgraph.learned.samples import Lessons
-from symgraph.learned.schedule import Stage, World
+from symgraph.learned.schedule import Exploration, Stage, World
 from symgraph.objective import Objective
 from symgraph.optimizers.problem import Optimizer
 from symgraph.outcomes import ModelNumbers
@@ -178,7 +178,7 @@ class OnlineLoop:
             given: {label: value} of states that it does not observe.
         """
         knowledge = self._knowledge()
-        decider = Decider(self._planning, knowledge, 0, (0.0, 0.0), self._starts(0))
+        decider = Decider(self._planning, knowledge, 0, Exploration(episodes=0).at(0), self._starts(0))
         execution = Execution(self.graph, world, knowledge, 0)
         status, reason = "done", ""
         try:

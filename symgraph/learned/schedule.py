@@ -44,28 +44,31 @@ class Exploration:
     Beside it, `solve` explores by itself while a model has too few samples.
 
     Args:
-        choices: probability that an attempt's selections are drawn instead of planned, in the first episode.
-        noise: standard deviation of what is added to each action, as a share of its range, in the first episode.
+        selections: probability that an attempt's selections are drawn instead of planned, in the first episode.
+        actions: probability that its actions are drawn from their whole range, in the first episode.
+        noise: standard deviation of what is otherwise added to each action, as a share of its range, in the first
+            episode.
         episodes: after how many nothing is tried any more.
 
     Raises:
         InputError: a number outside its range.
     """
 
-    choices: float = 0.5
-    noise: float = 0.05
-    episodes: int = 40
+    selections: float = 0.5
+    actions: float = 0.5
+    noise: float = 0.1
+    episodes: int = 50
 
     def __post_init__(self) -> None:
-        for name, most in (("choices", 1.0), ("noise", 1.0), ("episodes", math.inf)):
+        for name, most in (("selections", 1.0), ("actions", 1.0), ("noise", 1.0), ("episodes", math.inf)):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= most:
                 raise InputError(f"Exploration: {name} = {value!r}; give a number from 0 to {most:g}")
 
-    def at(self, episode: int) -> tuple[float, float]:
-        """Return probability of drawn selections and standard deviation of the noise in an episode, from 0 on."""
+    def at(self, episode: int) -> Exploration:
+        """Return how much is tried in an episode, from 0 on, and in no other."""
         share = max(0.0, 1.0 - episode / self.episodes) if self.episodes else 0.0
-        return self.choices * share, self.noise * share
+        return Exploration(self.selections * share, self.actions * share, self.noise * share, 1)
 
 
 @dataclass(frozen=True)
