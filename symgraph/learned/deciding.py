@@ -146,8 +146,8 @@ class Decider:
             for label, value in plan.actions.items()
             if label in ahead or label not in actions  # what lies behind stays as it was
         }
-        kinds = {"selections": graph.selections(), "actions": graph.actions()}
-        drawn = [kind for kind, slots in kinds.items() if any(label in self._fixed for label in slots)]
+        kinds = (("selections", list(graph.selections())), ("actions", list(graph.actions())))
+        drawn = [kind for kind, labels in kinds if any(label in self._fixed for label in labels)]
         return {
             "actions": {**actions, **decided},
             "selections": {**selections, **plan.selections},
