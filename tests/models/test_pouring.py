@@ -11,6 +11,7 @@ import symgraph as sg
 from models import pouring
 from sims.pouring import ACTIONS, SKILLS, PouringWorld
 from sims.pouring.behaviour import Phase
+from sims.pouring.geometry import Receiver
 
 # The reward of amounts
 
@@ -290,6 +291,13 @@ def test_the_pouring_position_agrees_with_the_world(episode, predicted):
     corners = episode["start"]["receiver_corners"].reshape(4, 3)
     above = ACTION["pour_position"][1] - corners[0, 2]
     np.testing.assert_allclose(said, [-0.2, 0.0, above], atol=1e-12)
+
+
+def test_a_receiver_that_was_pushed_and_turned_is_seen_from_its_middle():
+    """By the world's own formulas, since its receiver has not moved yet when an episode begins."""
+    receiver, (x, y, yaw) = Receiver((0.25, 0.36, 0.17)), (0.9, 0.04, 0.3)
+    said = pouring.move_to_pour(ca.DM(receiver.corners(np.array([x, y, yaw]))), ca.DM([-0.2, 0.4]))
+    np.testing.assert_allclose(said["relative_position"].full()[:, 0], [-0.2, -y, 0.4 - 0.17], atol=1e-12)
 
 
 def test_rewards_of_moves_are_those_of_the_distances():
