@@ -163,7 +163,7 @@ def test_what_begins_to_vary_is_learned(more, warm):
     both = np.vstack([x, new]), np.vstack([y, np.sin(2 * new[:, :1]) + 0.3 * new[:, 1:2] + 2.0 * new[:, 2:]])
     assert one.fit(*both).warm == warm
     slope = (one.predict(far(new, 0.7))[0] - one.predict(far(new, -0.7))[0]) / 1.4
-    assert slope.mean() == pytest.approx(2.0, rel=0.3 if warm else 0.1)
+    assert slope.mean() == pytest.approx(2.0, rel=0.4 if warm else 0.1)
 
 
 def test_what_varies_no_more_is_forgotten():
