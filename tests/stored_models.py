@@ -54,4 +54,5 @@ def same(a, b):
 @cache
 def flow():
     """A network whose options are not the default ones; it is not fitted again."""
-    return fitted(propagation="diagonal", samples_needed=7, name="flow")
+    resolution = {"u": 0.01, "x": (0.02, 0.0)}
+    return fitted(propagation="diagonal", samples_needed=7, resolution=resolution, name="flow")

@@ -411,3 +411,76 @@ def test_models_with_large_matrices_are_not_written_out():
     mean = np.array([0.1, -0.2, 0.3])
     value = sg.Objective(sg.unroll(graph), compiled=False).value({"x": mean})
     assert value == pytest.approx(np.sum(second @ np.tanh(first @ mean)), rel=1e-12)
+
+
+# What a bound model says of itself
+
+
+def bound(model):
+    """The model as a graph holds it, on the edge from "aim" to "landed"."""
+    graph = sg.Graph(SLOTS, "aim")
+    graph.edge("aim", "landed", model)
+    ((group,),) = (graph.groups["aim"],)
+    return group.branches[0].model
+
+
+def test_names_of_a_model_lead_to_labels():
+    plain = bound(lambda speed, target: {"hit": speed, "lower_muzzle": target})
+    assert plain.sources == {"speed": "speed", "target": "target"}
+    assert plain.targets == {"hit": "hit", "lower_muzzle": "lower_muzzle"}
+    rename = {"x": "speed", "w": "speed", "y": "hit", "z": "target"}
+    renamed = bound(sg.Model(lambda x, w, target: {"y": x * w, "z": target}, rename=rename))
+    assert renamed.sources == {"x": "speed", "w": "speed", "target": "target"}
+    assert renamed.targets == {"y": "hit", "z": "target"}
+    assert renamed.reads == ("speed", "target")  # labels, each once
+    assert bound(lambda speed: {}).targets == {}
+
+
+def test_names_of_a_model_are_copies():
+    model = bound(sg.Model(double_of, rename={"x": "speed"}))
+    model.sources["x"] = model.targets["hit"] = "target"
+    assert (model.sources, model.targets) == ({"x": "speed"}, {"hit": "hit"})
+
+
+def double_of(x):
+    return {"hit": 2 * x}
+
+
+def test_a_reward_and_a_probability_have_targets_too():
+    graph = sg.Graph(SLOTS, "aim")
+    graph.chance("aim", {"yes": ("landed", None), "no": ("lost", None)}, lambda speed: {"yes": speed, "no": 1 - speed})
+    graph.reward("landed", lambda hit: hit)
+    assert graph.groups["aim"][0].probability.targets == {"yes": "yes", "no": "no"}
+    assert set(graph.groups["landed"][0].branches[0].model.targets.values()) == {"reward"}
+
+
+class Fitted(Own):
+    """A propagator that can be fitted."""
+
+    def fit(self, x, y):
+        raise NotImplementedError
+
+
+def test_a_learner_is_what_propagates_and_can_be_fitted():
+    network = sg.learned.StochasticNetwork({"x": 1}, {"y": 1}, (3,))
+    model = bound(sg.Model(network, rename={"x": "speed", "y": "hit"}))
+    assert model.learner is network
+    assert (model.sources, model.targets) == ({"x": "speed"}, {"y": "hit"})
+    view = bound(sg.Model(network, rename={"x": "speed", "y": "hit"}, propagation="diagonal")).learner
+    assert view.propagation == "diagonal"
+    assert view.parameters[0] is network.parameters[0]  # so that a fit of either is one of both
+    own = Fitted(lambda inputs: {"hit": inputs["speed"]})
+    assert bound(own).learner is own
+    branches = sg.learned.BranchNetwork({"speed": 1}, ["yes", "no"], (3,))
+    graph = sg.Graph(SLOTS, "aim")
+    graph.chance("aim", {"yes": ("landed", None), "no": ("lost", None)}, branches)
+    assert graph.groups["aim"][0].probability.learner is branches
+
+
+def test_what_cannot_be_fitted_or_does_not_propagate_is_no_learner():
+    def with_fit(speed):
+        return {"hit": speed}
+
+    with_fit.fit = lambda x, y: None
+    for model in (lambda speed: {"hit": speed}, with_fit, Own(lambda inputs: {"hit": inputs["speed"]})):
+        assert bound(model).learner is None

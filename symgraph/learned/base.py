@@ -145,7 +145,7 @@ class LearnedModel(ABC):
         """
         saved = type(self).load(path)
         here, there = self.settings, saved.settings
-        other = [name for name in here if here[name] != there[name]]
+        other = [name for name in here if _in_order(here[name]) != _in_order(there[name])]
         if other:
             raise StorageError(
                 f"{os.fspath(path)} holds a model with {other[0]} = {there[other[0]]!r}, {self.name!r} has "
@@ -187,6 +187,11 @@ class LearnedModel(ABC):
     def __repr__(self) -> str:
         reads, writes = ", ".join(self.reads), ", ".join(self.writes)
         return f"{type(self).__name__}({self.name}: {reads} → {writes}, hidden {self.hidden}, {self.samples} samples)"
+
+
+def _in_order(setting: Any) -> Any:
+    """Return a setting that equals another only if its labels come in the same order, as the columns of samples do."""
+    return list(setting.items()) if isinstance(setting, Mapping) else setting
 
 
 def layer_sizes(settings: Mapping[str, Any], outputs: int) -> tuple[int, ...]:

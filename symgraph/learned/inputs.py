@@ -40,7 +40,7 @@ def checked_count(value: Any, place: str) -> int:
 
 
 def checked_resolution(given: Any, reads: Mapping[str, int], place: str) -> dict[str, list[float]]:
-    """Return {label: a number of at least 0 for each element}, for labels that are read.
+    """Return {label: a number of at least 0 for each element}, in the order of the labels that are read.
 
     Raises:
         InputError: another label, a number or shape that does not fit.
@@ -63,7 +63,7 @@ def checked_resolution(given: Any, reads: Mapping[str, int], place: str) -> dict
                 f"{reads[label]} elements"
             )
         checked[label] = np.broadcast_to(numbers, reads[label]).tolist()
-    return checked
+    return {label: checked[label] for label in reads if label in checked}
 
 
 def checked_hidden(hidden: Any, place: str) -> tuple[int, ...]:

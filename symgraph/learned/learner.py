@@ -116,14 +116,16 @@ class Learner:
             last_bias: (m,) where a fit from scratch begins; 0 if left out.
         """
         count = 1 + schedule.active
+        # What does not vary has no part in predictions; a network that saw how it deviates would rely on it.
+        inputs = np.where(scaling[0].varies, scaling[0](x), 0.0)
         if schedule.warm and memory is not None and memory.copies.count >= count:
             copies = rescaled(memory.copies.first(count), (memory.x, memory.y), scaling)
         else:
-            copies = initial_copies(sizes, scaling[0](x), count, rng)
+            copies = initial_copies(sizes, inputs, count, rng)
             if last_bias is not None:
                 copies.biases[-1][:] = last_bias
         targets = y if scaling[1] is None else scaling[1](y)
         steps = default_steps(len(x), max(sizes[1:-1], default=100))
         steps = round(WARM_SHARE * steps) if schedule.warm else steps
-        training = train(copies, scaling[0](x), targets, schedule.folds, loss, steps, rng, progress)
+        training = train(copies, inputs, targets, schedule.folds, loss, steps, rng, progress)
         return Memory(training.copies, *scaling), training
