@@ -32,9 +32,8 @@ format: $(SETUP)  ## lay the code out as `make test` wants it
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
-pour: $(SETUP)  ## show the planner at work
-	@echo "Pouring is not here yet; this is the cannon, docs/examples/cannon.py."
-	PYTHONPATH=. $(BIN)/python docs/examples/cannon.py
+pour: $(SETUP)  ## learn to pour; options: make pour ARGS="--material vsc"
+	PYTHONPATH=. $(BIN)/python docs/examples/pour.py $(ARGS)
 
 docs: $(SETUP)-docs  ## build the site, running every example, in docs/_build/html
 	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html

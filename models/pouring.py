@@ -139,12 +139,22 @@ def _square_above_zero(mean: ca.MX, variance: ca.MX) -> ca.MX:
     return (mean**2 + variance) * below + mean * sd * density
 
 
+# Each trial is planned anew when the source is at the receiver.
+DECISIONS = ("at_receiver",)
+# Single accidents spill 30 to 70 spheres; learned as they are, nothing else would count. [amount]
+LIMITS = {"spilled_change": (0.0, 1.0)}
+# Standard deviations below which what is observed is noise [length, amount].
+RESOLUTION = {"relative_position": 0.01, "target_change": 0.005, "receiver_size": 0.01}
+# Of the networks: wide enough for some hundred episodes, quick to fit and to plan with.
+NETWORK = {"hidden": (64, 64), "propagation": "low-rank"}
+
+
 def flow_network(skill: str, **options: Any) -> sg.learned.StochasticNetwork:
     """F_flowc_tip or F_flowc_shake, to be learned: how much a skill lets out, where and how widely it comes down.
 
     Args:
         skill: "tip" or "shake".
-        options: of `StochasticNetwork`.
+        options: of `StochasticNetwork`, in place of those above.
 
     Raises:
         ValueError: there is no such skill.
@@ -156,14 +166,18 @@ def flow_network(skill: str, **options: Any) -> sg.learned.StochasticNetwork:
     if skill not in actions:
         raise ValueError(f"skill is {skill!r}; choose from {list(SKILLS)}")
     reads = {**BEFORE_POURING, **MATERIAL, **actions[skill]}
-    return sg.learned.StochasticNetwork(reads, FLOW, **{"name": f"F_flow_{skill}", **options})
+    resolution = {**RESOLUTION, "grasp_height": 0.01, "mouth": 0.003}
+    settings = {"name": f"F_flow_{skill}", "resolution": resolution, **NETWORK, **options}
+    return sg.learned.StochasticNetwork(reads, FLOW, **settings)
 
 
 def amount_network(**options: Any) -> sg.learned.StochasticNetwork:
     """F_amount, to be learned from both skills: how much of a flow is poured, how much is spilled."""
     reads = {"relative_position": 3, "target_change": 1, "receiver_size": 3, **MATERIAL, **FLOW}
     writes = {"poured_change": 1, "spilled_change": 1}
-    return sg.learned.StochasticNetwork(reads, writes, **{"name": "F_amount", **options})
+    return sg.learned.StochasticNetwork(
+        reads, writes, **{"name": "F_amount", "resolution": RESOLUTION, **NETWORK, **options}
+    )
 
 
 def graph(flow_tip: Any, flow_shake: Any, amount: Any, *, shaped: bool = False) -> sg.Graph:

@@ -7,7 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Protocol
 
@@ -17,9 +17,10 @@ import numpy as np
 
 from sims.pouring.census import SphereClass
 from sims.pouring.geometry import SPHERES
+from sims.pouring.observation import Observation
 from sims.pouring.scene import CONTROL_STEP
 from sims.pouring.simulation import Simulation
-from sims.pouring.world import PouringWorld
+from sims.pouring.world import Actions, PouringWorld, Selections
 
 VIDEO_ENDINGS = (".mp4", ".gif")
 COLOURS = {
@@ -119,6 +120,42 @@ def film(world: PouringWorld, camera: Camera, every: int = 8) -> Iterator[list[n
         yield frames
     finally:
         listeners.remove(look)
+
+
+class FilmedWorld:
+    """A world that is filmed from each reset to the next.
+
+    Args:
+        world: What to film.
+        every: Control steps from one picture to the next.
+
+    Attributes:
+        frames: Pictures of the present episode.
+    """
+
+    def __init__(self, world: PouringWorld, every: int = 4) -> None:
+        self._world = world
+        self._every = every
+        self._camera = Camera(world)
+        self._film = ExitStack()
+        self.frames: list[np.ndarray] = []
+
+    def reset(self, seed: int) -> Observation:
+        """Begin an episode and its film."""
+        seen = self._world.reset(seed)
+        self._film.pop_all()  # the old listener went with the old simulation
+        self.frames = self._film.enter_context(film(self._world, self._camera, self._every))
+        return seen
+
+    def execute(self, node: str, actions: Actions, selections: Selections | None = None) -> dict[str, Observation]:
+        """Do what leaves a node."""
+        return self._world.execute(node, actions, selections)
+
+    def close(self) -> None:
+        """Let go of the camera and the world."""
+        self._film.close()
+        self._camera.close()
+        self._world.close()
 
 
 def strip(frames: Sequence[np.ndarray], count: int = 6) -> np.ndarray:

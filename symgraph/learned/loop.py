@@ -23,6 +23,8 @@ from symgraph.learned.schedule import Exploration, Stage, World
 from symgraph.objective import Objective
 from symgraph.optimizers.problem import Optimizer
 from symgraph.outcomes import ModelNumbers
+from symgraph.plan import Plan
+from symgraph.planner import solve
 from symgraph.tree import unroll
 
 STORE = "episodes.sqlite"  # in the folder of a loop
@@ -151,6 +153,11 @@ class OnlineLoop:
         return sum(stage.episodes for stage in self.stages)
 
     @property
+    def done(self) -> int:
+        """How many of them are over."""
+        return sum(episode.status != "running" for episode in self.store.episodes())
+
+    @property
     def settings(self) -> dict[str, Any]:
         """What the episodes depend on, beside the worlds."""
         return {
@@ -168,6 +175,19 @@ class OnlineLoop:
         """Run the episodes that are still to come, with a report after each."""
         while (number := self._next()) < self.episodes:
             yield self._learn(number)
+
+    def plan(self, known: Mapping[str, Any], node: str | None = None) -> Plan:
+        """Return the best plan from a node where decisions are made, with what has been learned so far.
+
+        Args:
+            known: {label: value} of what is known there; labels that are no states of the graph are ignored.
+            node: the graph's start if left out.
+        """
+        node = self.graph.start if node is None else node
+        if node not in self.decisions:
+            raise InputError(f"nothing is planned at {node!r}{did_you_mean(node, self.decisions)}")
+        state = {label: known[label] for label in self.graph.states() if label in known}
+        return solve(self._planning.objectives[node], state, self._planning.optimizer, progress=False)
 
     def perform(self, world: World, seed: int, given: Mapping[str, Any] | None = None) -> EpisodeReport:
         """Run an episode with the best plans; nothing is tried, learned or stored.
