@@ -3,9 +3,9 @@ Learning to pour
 ================
 
 A robot holds a container with a narrow mouth and 100 spheres in it, which behave like water, like bouncing balls or
-like paste. It is to pour 55 of them into another container. It can *tip* its container, or turn it upside down and *shake*;
-neither is best everywhere. How spheres flow it does not know: it learns that while it pours, as in section VII of
-Yamaguchi & Atkeson, *Differential Dynamic Programming for Graph-Structured Dynamical Systems*, Humanoids 2016.
+like paste. It is to pour 55 of them into another container. It can *tip* its container, or turn it upside down and
+*shake*; neither is best everywhere. How spheres flow it does not know: it learns that while it pours, as in section VII
+of Yamaguchi & Atkeson, *Differential Dynamic Programming for Graph-Structured Dynamical Systems*, Humanoids 2016.
 
 ``make pour`` runs this file: about four minutes for 80 episodes. Other tasks are options, such as
 ``make pour ARGS="--material vsc --mouth 0.13"``; ``make pour ARGS=--help`` lists them.
@@ -58,7 +58,11 @@ def loop_in(world, setup, episodes, seed, folder):
     graph = pouring.graph(pouring.flow_network("tip"), pouring.flow_network("shake"), pouring.amount_network())
     return sg.learned.OnlineLoop(
         graph,
-        [sg.learned.Stage(setup, world, episodes, sg.learned.Exploration(episodes=0.6 * episodes))],
+        [
+            sg.learned.Stage(
+                setup, world, episodes, sg.learned.Exploration(selections=1.0, actions=1.0, episodes=0.6 * episodes)
+            )
+        ],
         folder,
         decisions=pouring.DECISIONS,
         limits=pouring.LIMITS,
@@ -147,7 +151,7 @@ def draw_curve(loop, folder):
             axes.scatter(np.flatnonzero(at) + 1, returns[at], marker=marker, facecolors=shade, label=label)
     axes.set(yscale="symlog", xlabel="episode", ylabel="return", title="Learning to pour")
     axes.legend(ncols=2, fontsize="small")
-    figure.savefig(folder / "learning_curve.svg")
+    figure.savefig(folder / "learning_curve.png", dpi=150)
 
 
 # %%
@@ -166,7 +170,7 @@ def draw_map(loop, setup, folder):
     axes.set(xlabel="mouth", yticks=range(len(MATERIALS)), yticklabels=MATERIALS, ylim=(-0.5, len(MATERIALS) - 0.5))
     axes.set_title("Planned skill: ○ tip, △ shake")
     figure.colorbar(picture, label="expected return")
-    figure.savefig(folder / "skill_map.svg")
+    figure.savefig(folder / "skill_map.png", dpi=150)
 
 
 # %%
