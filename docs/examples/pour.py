@@ -144,11 +144,12 @@ def draw_curve(loop, folder):
     skills = np.array([episode.info["selections"]["skill"] for episode in episodes])
     explored = np.array([bool(episode.info["explored"]) for episode in episodes])
     figure, axes = plt.subplots(figsize=(8, 3.5), layout="constrained")
-    for skill, marker in (("tip", "o"), ("shake", "^")):
-        for tried, shade in ((True, "none"), (False, None)):
+    for skill, marker, colour in (("tip", "o", "tab:blue"), ("shake", "^", "tab:orange")):
+        for tried in (True, False):
             at = (skills == skill) & (explored == tried)
             label = f"{skill}, {'explored' if tried else 'planned'}"
-            axes.scatter(np.flatnonzero(at) + 1, returns[at], marker=marker, facecolors=shade, label=label)
+            shade = "none" if tried else colour
+            axes.scatter(np.flatnonzero(at) + 1, returns[at], 25, shade, marker, edgecolors=colour, label=label)
     axes.set(yscale="symlog", xlabel="episode", ylabel="return", title="Learning to pour")
     axes.legend(ncols=2, fontsize="small")
     figure.savefig(folder / "learning_curve.png", dpi=150)
