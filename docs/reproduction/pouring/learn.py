@@ -54,7 +54,7 @@ def run(
         look()
         try:
             work(
-                learn,
+                go_on,
                 [job for job in jobs if not job.finished],
                 processes,
                 ready=lambda job: job.basis is None or job.basis.finished,
@@ -70,7 +70,7 @@ def collect(folder: Folder = RUNS, results: Results = RESULTS) -> None:
     rebuild(folder, results)
 
 
-def learn(job: Run) -> None:
+def go_on(job: Run) -> None:
     """Do what is left of a run; it begins with a copy of the run that it builds on."""
     if job.basis is not None and not job.folder.exists():
         part = job.folder.with_name(f"{job.folder.name}.part")
@@ -100,4 +100,6 @@ def rebuild(folder: Path, results: Path, begun: Collection[Run] = ()) -> None:
 
 
 if __name__ == "__main__":
-    app()
+    import learn  # by that name its processes find it
+
+    learn.app()

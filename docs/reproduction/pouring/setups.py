@@ -150,7 +150,7 @@ class Run:
         return self.done >= self.condition.episodes
 
     def loop(self) -> OnlineLoop:
-        """Return the loop in its folder. All conditions have the graph with a bonus, so that runs can build on others."""
+        """Return the loop in its folder; the graph has a bonus in all conditions, so that runs can build on others."""
         networks = pouring.flow_network("tip"), pouring.flow_network("shake"), pouring.amount_network()
         return OnlineLoop(
             pouring.graph(*networks, shaped=True),
@@ -270,25 +270,23 @@ def seed_of(run: int, number: int) -> int:
     return int(np.random.SeedSequence([run, number]).generate_state(1)[0])
 
 
-def chosen(only: Sequence[str], episodes: int | None = None) -> list[Condition]:
-    """Return the conditions whose key fits a pattern such as "setup2*", after those that they build on.
+def chosen(only: Sequence[str], episodes: int | None = None, *, bases: bool = True) -> list[Condition]:
+    """Return the conditions whose key fits a pattern such as "setup2*".
+
+    Args:
+        only: the patterns.
+        episodes: of each, at most.
+        bases: whether those that they build on come with them.
 
     Raises:
         SystemExit: none fits.
     """
-    found: dict[str, Condition] = {}
-
-    def add(condition: Condition) -> None:
-        if condition.after is not None:
-            add(condition.after)
-        found[condition.key] = condition if episodes is None else condition.shortened(episodes)
-
-    for condition in CONDITIONS:
-        if any(fnmatch(condition.key, pattern) for pattern in only):
-            add(condition)
+    found = {one for one in CONDITIONS if any(fnmatch(one.key, pattern) for pattern in only)}
     if not found:
         raise SystemExit(f"no condition fits {list(only)}; there are {[one.key for one in CONDITIONS]}")
-    return list(found.values())
+    while bases and (more := {one.after for one in found} - found - {None}):
+        found |= more
+    return [one if episodes is None else one.shortened(episodes) for one in CONDITIONS if one in found]
 
 
 def read(path: Path) -> list[dict[str, str]]:
