@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from symgraph.learned import EpisodeStore
+
 ROOT = Path(__file__).parents[1]
 PROGRAMS = ROOT / "docs/reproduction/pouring"
 
@@ -68,7 +70,8 @@ def test_runs_are_killed_gone_on_with_built_upon_evaluated_and_drawn(tmp_path):
 
     # The second run begins with the first one's episodes, to the last bit.
     second = Run(chosen(["setup2/PT1-Rshake"], 2, bases=False)[0], 0, tmp_path / "runs")
-    with first._store() as earlier, second._store() as later:
+    stores = (EpisodeStore(one.folder / "episodes.sqlite", read_only=True) for one in (first, second))
+    with next(stores) as earlier, next(stores) as later:
         assert [one.setup for one in later.episodes()] == ["setup1", "setup1", "setup2", "setup2"]
         assert later.episodes()[:2] == earlier.episodes()
         assert [v for k in range(2) for v in later.visits(k)] == earlier.visits()

@@ -1,7 +1,7 @@
 """Draw the paper's figures 9 to 12, and make the tables of the page.
 
-From the repository's root: `python docs/reproduction/pouring/figures.py`. The figures and the first table
-come from results.csv beside this program alone, the other tables from evaluation.csv and baselines.csv.
+From the repository's root: `python docs/reproduction/pouring/figures.py`. The figures and the first table come
+from results.csv beside this program alone, the other tables from evaluation.csv and baselines.csv.
 """
 
 from __future__ import annotations
@@ -63,7 +63,8 @@ def draw_curves(axes: plt.Axes, rows: list[Row], setup: str, names: Sequence[str
         mean = np.mean([curve[:shortest] for curve in curves], axis=0)
         axes.plot(np.arange(1, shortest + 1), mean, color=f"C{k}", linewidth=2, label=name)
     axes.set_xlabel("episode")
-    axes.legend(fontsize="small")
+    if axes.get_lines():
+        axes.legend(fontsize="small")
 
 
 def figure_9(rows: list[Row]) -> plt.Figure:
@@ -121,7 +122,7 @@ def figure_12(rows: list[Row]) -> plt.Figure:
     shapes = [
         plt.Line2D([], [], color=f"C{k}", marker=MARKERS[s], linestyle="", label=s) for k, s in enumerate(MARKERS)
     ]
-    panels[0].legend(handles=shapes, fontsize="small", loc="upper left")
+    figure.legend(handles=shapes, loc="outside right upper")
     return figure
 
 
