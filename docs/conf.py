@@ -22,7 +22,8 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["_build", "examples"]
+# The page on pouring waits for its figures; it goes into the toctree of reproduction/index.md with them.
+exclude_patterns = ["_build", "examples", "reproduction/pouring/index.md"]
 default_role = "py:obj"  # `name` is code, and a link where the name has a page
 
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist"]

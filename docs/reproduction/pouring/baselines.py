@@ -1,0 +1,219 @@
+"""Pour without learning: random actions, fixed ones, a rule that chooses between these, and the best of many tries.
+
+From the repository's root, `python docs/reproduction/pouring/baselines.py --runs 2`. Every policy makes one attempt in
+each situation. Every attempt becomes a row of baselines.csv beside this program; those that are there are not made
+again. The situations are those of the runs without pre-training, by their numbers, and the fresh ones of `evaluate.py`.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from processes import display, work
+from setups import FOLDER, FRESH, OUTCOME, SETUPS, append, outcome, read, rounded, seed_of, write
+
+import symgraph as sg
+from models import pouring
+from sims.pouring import ACTIONS, SKILLS, PouringWorld
+from sims.pouring.world import RECEIVER_RANGE
+from symgraph.learned.execution import Execution, WorldFailed
+from symgraph.learned.knowledge import Knowledge
+from symgraph.outcomes import ModelNumbers
+
+BASELINES = FOLDER / "baselines.csv"
+COLUMNS = ("setup", "policy", "run", "situation", "status", *OUTCOME, "tried", "simulating")
+FRESH_RUN = "fresh"  # stands in place of a run's number
+
+Actions = Mapping[str, Any]
+
+GOOD: dict[str, dict[str, Any]] = {  # one set of actions for each skill, good in many situations
+    "tip": {"pour_position": (-0.19, 0.327), "tilt_rate": 0.014, "search_rate": 0.003},
+    "shake": {
+        "pour_position": (-0.20, 0.33),
+        "tilt_rate": 0.010,
+        "shake_speed": 0.75,
+        "shake_stroke": (0.06, -math.pi / 2),
+    },
+}
+GRASP = 0.3  # share of the source's height; it changes little
+# Further back everything falls short of the receiver, further forward or higher it flies over it.
+USEFUL_POSITIONS = (-0.26, 0.32), (-0.10, 0.42)
+FRICTION = 0.225  # halfway between wat or bnc, which are to be tipped, and vsc or vsc+
+TRIES, BALLOT = 1, 2  # joined with other numbers, what is drawn for them
+
+
+@dataclass(frozen=True)
+class Job:
+    """One attempt: which policy in which situation.
+
+    Attributes:
+        setup: of the situation.
+        policy: a name of `POLICIES`.
+        run: whose situation it is, or "fresh".
+        situation: its number.
+        tries: of the best of many.
+    """
+
+    setup: str
+    policy: str
+    run: str
+    situation: int
+    tries: int
+
+    @property
+    def seed(self) -> int:
+        """Of the world."""
+        return FRESH + self.situation if self.run == FRESH_RUN else seed_of(int(self.run), self.situation)
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """What tells it from others in the file."""
+        return self.setup, self.policy, self.run, str(self.situation)
+
+
+def random_choice(job: Job, world: PouringWorld) -> tuple[str, Actions]:
+    """Both skills in turn, with actions from their whole range."""
+    rng = np.random.default_rng([job.seed, BALLOT])
+    return SKILLS[job.situation % 2], {
+        label: bounds.scale(rng.random(len(bounds.low))) for label, bounds in ACTIONS.items()
+    }
+
+
+def always_tip(job: Job, world: PouringWorld) -> tuple[str, Actions]:
+    """The same tip everywhere."""
+    return "tip", GOOD["tip"]
+
+
+def always_shake(job: Job, world: PouringWorld) -> tuple[str, Actions]:
+    """The same shake everywhere."""
+    return "shake", GOOD["shake"]
+
+
+def rule(job: Job, world: PouringWorld) -> tuple[str, Actions]:
+    """Tip wat, bnc and what is like them, shake all else."""
+    world.reset(job.seed)
+    skill = "shake" if world.behaviour.simulation.material.friction > FRICTION else "tip"
+    return skill, GOOD[skill]
+
+
+POLICIES = {"random": random_choice, "always tip": always_tip, "always shake": always_shake, "rule": rule}
+BEST = "best of tries"
+
+
+@functools.cache
+def task() -> tuple[sg.Graph, ModelNumbers]:
+    """The graph, whose networks nobody asks here, and what evaluates its rewards."""
+    networks = pouring.flow_network("tip"), pouring.flow_network("shake"), pouring.amount_network()
+    return pouring.graph(*networks), ModelNumbers()
+
+
+def attempt(world: PouringWorld, seed: int, skill: str, actions: Actions) -> dict[str, Any]:
+    """Pour once, with the rewards that an on-line loop would get; return the columns from "status" on."""
+    graph, models = task()
+    knowledge = Knowledge(graph, models, pouring.DECISIONS)
+    execution = Execution(graph, world, knowledge, 0)
+    decision = {"grasp_ratio": GRASP, **actions}, {"skill": skill}
+    status, observed = "done", {}
+    try:
+        execution.run(
+            seed,
+            {},
+            decide=lambda visit: decision,
+            reached=lambda visits, new: None,
+            goes_on=lambda visit: any(group.kind != "reward" for group in graph.groups.get(visit.node, ())),
+        )
+    except WorldFailed as failure:
+        status, observed = "failed", failure.observed or {}
+    known = knowledge.at[execution.visits[-1].step] | observed
+    total = math.fsum(visit.reward for visit in execution.visits) if status == "done" else math.nan
+    return {"status": status, **outcome(known, skill, total), "simulating": rounded(execution.seconds)}
+
+
+def best_of_tries(job: Job, world: PouringWorld) -> dict[str, Any]:
+    """Try actions of both skills in a situation, then do the best ones in the same situation with new noise.
+
+    What is noise in the world is how the spheres have settled in the source. A world in which nothing is left to draw
+    has the situation under every seed, and the seed decides the settling alone.
+    """
+    world.reset(job.seed)
+    rng = np.random.default_rng([job.seed, TRIES])
+    tried: list[tuple[float, str, Actions]] = []
+    for number in range(job.tries):
+        skill = SKILLS[number % 2]
+        actions = GOOD[skill] if number < len(SKILLS) else _useful(rng)
+        total = attempt(world, job.seed, skill, actions)["return"]
+        tried.append((float(total or -math.inf), skill, actions))
+    total, skill, actions = max(tried, key=lambda one: one[0])
+    return {**attempt(same_situation(world), job.seed + 1, skill, actions), "tried": rounded(total)}
+
+
+def _useful(rng: np.random.Generator) -> Actions:
+    """Draw actions from their whole range, but positions where most is poured into the receiver."""
+    drawn = {label: bounds.scale(rng.random(len(bounds.low))) for label, bounds in ACTIONS.items()}
+    return drawn | {"pour_position": rng.uniform(*USEFUL_POSITIONS)}
+
+
+def same_situation(world: PouringWorld) -> PouringWorld:
+    """Return a world whose every reset leads to the situation of this one's episode, and settles the spheres anew."""
+    simulation, behaviour = world.behaviour.simulation, world.behaviour
+    return PouringWorld(
+        simulation.material,
+        simulation.source.mouth,
+        behaviour.target,
+        # The receiver is free-standing; what little it was moved since may have taken it out of the range.
+        float(np.clip(simulation.receiver_pose[0], *RECEIVER_RANGE)),
+        simulation.receiver.size,
+    )
+
+
+def pour(job: Job, results: Path) -> None:
+    """Do a job and write it down."""
+    world = PouringWorld(**SETUPS[job.setup])
+    if job.policy == BEST:
+        row = best_of_tries(job, world)
+    else:
+        row = attempt(world, job.seed, *POLICIES[job.policy](job, world))
+    about = dict(zip(COLUMNS[:4], job.key, strict=True))
+    append(results, COLUMNS, [{**about, **row}])
+
+
+def main(
+    runs: Annotated[int, typer.Option(min=0, help="In whose situations is poured.")] = 2,
+    situations: Annotated[int, typer.Option(min=0, help="Of each run.")] = 80,
+    fresh: Annotated[int, typer.Option(min=0, help="Situations that no run meets.")] = 40,
+    best: Annotated[
+        int, typer.Option(min=0, help="In how many of each, the first ones, to find the best of tries.")
+    ] = 40,
+    tries: Annotated[int, typer.Option(min=2)] = 30,
+    processes: Annotated[int, typer.Option(min=1)] = 2,
+    results: Annotated[Path, typer.Option(help="File of the attempts.")] = BASELINES,
+) -> None:
+    """Pour, where it has not been done already."""
+    rows = read(results)
+    write(results, COLUMNS, rows)
+    done = {tuple(row[name] for name in COLUMNS[:4]) for row in rows}
+    where = [(FRESH_RUN, k) for k in range(fresh)] + [(str(run), k) for run in range(runs) for k in range(situations)]
+    jobs = [Job(setup, name, *at, tries) for at in where for setup in ("general", "varied") for name in POLICIES]
+    jobs += [Job("varied", BEST, *at, tries) for at in where if at[1] < best]
+    jobs = [job for job in jobs if job.key not in done]
+    with display() as progress:
+        bar = progress.add_task("pouring", total=len(jobs))
+        work(
+            functools.partial(pour, results=results),
+            jobs,
+            processes,
+            look=lambda: progress.update(bar, completed=len(results.read_text().splitlines()) - 1 - len(rows)),
+        )
+
+
+if __name__ == "__main__":
+    import baselines  # by that name its processes find it
+
+    typer.run(baselines.main)

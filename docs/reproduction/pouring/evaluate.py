@@ -1,0 +1,89 @@
+"""Let finished runs pour in situations that none of them has met, without exploring or learning.
+
+From the repository's root, after `learn.py run`: `python docs/reproduction/pouring/evaluate.py --runs 2`. Every attempt
+becomes a row of evaluation.csv beside this program; those that are there are not made again.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from processes import display, work
+from setups import FOLDER, FRESH, OUTCOME, RUNS, SETUPS, Run, append, chosen, outcome, read, rounded, write
+
+from sims.pouring import PouringWorld
+
+EVALUATION = FOLDER / "evaluation.csv"
+COLUMNS = ("setup", "condition", "run", "situation", "status", *OUTCOME, "expected", "simulating", "planning")
+Job = tuple[Run, tuple[int, ...]]  # which situations are to come
+
+
+def main(
+    runs: Annotated[int, typer.Option(min=1, help="Of each condition.")] = 2,
+    situations: Annotated[int, typer.Option(min=1, help="The same ones for all runs in a setup.")] = 40,
+    processes: Annotated[int, typer.Option(min=1)] = 2,
+    only: Annotated[list[str] | None, typer.Option(help='Conditions such as "general*".')] = None,
+    episodes: Annotated[int | None, typer.Option(min=1, help="That learn.py was given, if it was.")] = None,
+    folder: Annotated[Path, typer.Option(help="Of the runs.")] = RUNS,
+    results: Annotated[Path, typer.Option(help="File of the attempts.")] = EVALUATION,
+) -> None:
+    """Pour, where it has not been done already."""
+    rows = read(results)
+    write(results, COLUMNS, rows)
+    done = {tuple(row[name] for name in COLUMNS[:4]) for row in rows}
+    jobs = []
+    for condition in chosen(only or ["*"], episodes, bases=False):
+        for run in (Run(condition, number, folder) for number in range(runs)):
+            key = condition.setup, condition.name, str(run.number)
+            missing = tuple(k for k in range(situations) if (*key, str(k)) not in done)
+            if run.finished and missing:
+                jobs.append((run, missing))
+            elif missing:
+                typer.echo(f"{condition.key}, run {run.number}: not finished, left out")
+    with display() as progress:
+        bar = progress.add_task("evaluating", total=sum(len(missing) for _, missing in jobs))
+        work(
+            functools.partial(pour, results=results),
+            jobs,
+            processes,
+            look=lambda: progress.update(bar, completed=len(results.read_text().splitlines()) - 1 - len(rows)),
+        )
+
+
+def pour(job: Job, results: Path) -> None:
+    """Pour in situations with what a run has learned, and write down each."""
+    run, situations = job
+    append(results, COLUMNS, rows_of(run, situations))
+
+
+def rows_of(run: Run, situations: Sequence[int]) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a finished run, one after the other."""
+    world = PouringWorld(**SETUPS[run.condition.setup])
+    no_bonus = replace(run.condition, favoured=None).bonus(0)
+    with run.loop() as loop:
+        for number in situations:
+            report = loop.perform(world, FRESH + number, {"bonus": no_bonus})
+            total = report.total if report.status == "done" else math.nan
+            yield {
+                "setup": run.condition.setup,
+                "condition": run.condition.name,
+                "run": run.number,
+                "situation": number,
+                "status": report.status,
+                **outcome(report.known, report.selections["skill"], total),
+                "expected": rounded(report.value),
+                "simulating": rounded(report.seconds["simulating"]),
+                "planning": rounded(report.seconds["planning"]),
+            }
+
+
+if __name__ == "__main__":
+    import evaluate  # by that name its processes find it
+
+    typer.run(evaluate.main)
