@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 
 import symgraph as sg
@@ -40,7 +41,7 @@ class Spy:
             self._weights.symbol[start : start + size].T @ inputs[label].mean
             for (label, size), start in zip(self.reads.items(), np.cumsum([0, *self.reads.values()]), strict=False)
         )
-        return {label: sg.Gaussian(total) for label in self.writes}
+        return {label: sg.Gaussian(ca.repmat(total, size, 1)) for label, size in self.writes.items()}
 
     def fit(self, x, y, *, seed, progress):
         self.fits.append((x, y, seed))
