@@ -82,6 +82,7 @@ def test_an_error_that_says_nothing_comes_out_and_the_episode_goes_on_later(tmp_
             assert error.__cause__ is cause
             assert [episode.status for episode in one.store.episodes()] == ["running"]
             assert [visit.node for visit in one.store.visits()] == ["aim", "moved"]
+            assert [len(lesson.x) for lesson in one._lessons.all.values()] == [1, 0]  # and not one more for each try
         with pytest.raises(ValueError, match="no such motor"):
             one.perform(world, 0)
     world = steady()
@@ -151,12 +152,12 @@ def test_a_world_that_leads_to_fewer_nodes_than_before_interrupts_the_episode(tm
     graph = sg.Graph({"u": sg.Action(low=-1.0, high=1.0), "y": sg.State()}, start="aim")
     graph.edge("aim", "left", lambda u: {"y": u})
     graph.edge("aim", "right")
-    graph.edge("left", "end")
+    graph.edge("right", "end")
     graph.reward("right", lambda: -1.0)
-    nodes = {"aim": {"left": {}, "right": {"y": 1.0}}, "left": raises(RuntimeError("power cut"))}
+    nodes = {"aim": {"left": {}, "right": {"y": 1.0}}, "right": raises(RuntimeError("power cut"))}
     with loop(tmp_path, graph, Scripted({}, nodes), 1) as one, pytest.raises(RuntimeError, match="power cut"):
         list(one)
-    nodes = {"aim": {"left": {}}, "left": {"end": {}}}
+    nodes = {"aim": {"left": {}}}
     with loop(tmp_path, graph, Scripted({}, nodes), 1) as one:
         (report,) = one
         assert (report.status, report.total) == ("interrupted", -1.0)

@@ -93,7 +93,9 @@ def test_more_episodes_in_the_last_stage_go_on_and_other_stages_are_refused(tmp_
     )
     refuses(lambda: made(3, 3), sg.InputError, words)
     refuses(lambda: made(2, 3, "c"), sg.InputError, "episode 2 is of stage 'b', but the stages have stage 'c' there")
-    refuses(lambda: made(2, 2), sg.InputError, "episode 4 is of stage 'b', but the stages have no such episode there")
+    refuses(
+        lambda: made(2, 2), sg.InputError, "episode 4 is of stage 'b', but the stages have no such episode; give those"
+    )
     made(2, 3).close()  # whatever was refused has let go of the folder
 
 
@@ -125,17 +127,12 @@ def test_other_settings_are_refused(tmp_path, change, changed):
 
 
 def test_two_loops_in_one_folder_are_refused(tmp_path):
-    code = "import time\nEpisodeStore(sys.argv[1])\nprint('open', flush=True)\n"
+    code = "try: EpisodeStore(sys.argv[1])\nexcept Exception as error: print(error)"
     with loop(tmp_path, kick_graph(), kicking(), 2) as one:
         next(iter(one))
         before = told(one.store)
         refuses(lambda: loop(tmp_path, kick_graph(), kicking(), 2), sg.StorageError, "is being written by this process")
-        said = output_of(
-            script(
-                f"try:\n    {code.splitlines()[1]}\nexcept Exception as e: print(e)",
-                str(one.folder / "episodes.sqlite"),
-            )
-        )
+        said = output_of(script(code, str(one.folder / "episodes.sqlite")))
         assert f"is being written by process {os.getpid()}" in said
         assert told(one.store) == before
         assert [report.number for report in one] == [1]
