@@ -74,8 +74,8 @@ def test_a_selection_that_lies_behind_is_kept_although_nothing_holds_it(tmp_path
     """A search from the decision so far ends on a low hill here; those that find the highest know of no hand."""
     world = carrying()
     graph = carry_graph(lambda y: ca.cos(6.0 * y) - 0.1 * y**2)
-    with loop(tmp_path, graph, world, 8, decisions=["lifted"]) as one:
-        assert [report.value for report in one] == pytest.approx([1.0] * 8)
+    with loop(tmp_path, graph, world, 8, decisions=["lifted"], remembered=0) as one:
+        assert [report.value for report in one] == pytest.approx([1.0] * 8, abs=0.2)
     assert [selections["hand"] for _, _, selections in world.calls] == ["right"] * 24
 
 
