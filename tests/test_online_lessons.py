@@ -229,6 +229,14 @@ def test_a_model_that_was_fitted_elsewhere_is_refused(tmp_path):
     )
 
 
+def test_a_reward_that_was_learned_before_is_used_as_it_is(tmp_path):
+    liked = Spy({"y": 1}, {"liking": 1}, "liked", [2.0])
+    liked.samples = 40
+    with loop(tmp_path, kick_graph(reward=liked), kicking(), 2) as one:
+        assert [report.total for report in one] == [2.0 * visit.observed["y"] for visit in one.store.visits()[1::2]]
+    assert liked.fits == []
+
+
 def test_models_that_cannot_be_kept_are_refused(tmp_path):
     class Half:
         name, reads, writes = "half", ("u", "s"), ("y",)

@@ -69,7 +69,9 @@ def test_what_is_given_must_be_states(tmp_path):
         ("typing error", {"bonos": [0.0, 0.0]}, "given: 'bonos' is no state; did you mean 'bonus'?"),
         ("action", {"u": 0.0}, "given: 'u' is no state"),
         ("nothing", lambda episode: None, "given = None; give {label: value}"),
-        ("size", {"bonus": 1.0}, "'bonus' with 1 elements, the slot has 2"),
+        ("size", {"bonus": 1.0}, "given: 'bonus' = 1.0; the slot takes 2 finite numbers"),
+        ("NaN", {"bonus": [0.0, np.nan]}, "given: 'bonus' = [0.0, nan]; the slot takes 2 finite numbers"),
+        ("words", {"bonus": ["a", "b"]}, "given 'bonus' = ['a', 'b'] is not a number or an array of numbers"),
     ):
         with loop(tmp_path / name, shaped_graph(), world_at(0.1), given=given) as one:
             refuses(lambda one=one: list(one), sg.InputError, words)

@@ -9,10 +9,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from symgraph.errors import InputError, did_you_mean, names
 from symgraph.graph import Graph
 from symgraph.learned.knowledge import Knowledge, branches_to
-from symgraph.learned.records import Visit, checked_visit, shown
+from symgraph.learned.records import Visit, checked_value, checked_visit, shown
 from symgraph.learned.schedule import World
 
 Decision = tuple[dict[str, Any], dict[str, str]]  # actions, selections
@@ -159,9 +161,13 @@ class Execution:
         if not isinstance(given, Mapping):
             raise InputError(f"given = {shown(given)}; give {{label: value}}")
         states = self._graph.states()
-        for label in given:
+        for label, value in given.items():
             if label not in states:
                 raise InputError(f"given: {label!r} is no state{did_you_mean(label, states)} States: {names(states)}")
+            if np.size(value) != states[label].size or not np.isfinite(checked_value(value, f"given {label!r}")).all():
+                raise InputError(
+                    f"given: {label!r} = {shown(value)}; the slot takes {states[label].size} finite numbers, give those"
+                )
         return given
 
     def _visit(

@@ -173,8 +173,11 @@ class Lessons:
 
 
 def _bound_models(graph: Graph) -> Iterable[BoundModel]:
+    """Return the models that can be taught: rewards are computed, not observed."""
     for groups in graph.groups.values():
         for group in groups:
+            if group.kind == "reward":
+                continue
             if isinstance(group.probability, BoundModel):
                 yield group.probability
             yield from (branch.model for branch in group.branches if branch.model is not None)
