@@ -128,7 +128,7 @@ def test_a_world_that_does_not_lead_back_ends_the_episode(tmp_path):
     assert [node for node, *_ in world.calls].count("thrown") == 2
 
 
-def tried(folder, explore, episodes=250):
+def tried(folder, explore, episodes=160):
     """Decisions, plans and what was explored, of kicks whose best is the skill "far" with u = 0.8."""
     world = Scripted({"s": 0.2}, {"aim": lambda a, s, w: {f"{s['skill']}_end": {"y": 0.5}}})
     with loop(folder, kick_graph(), world, episodes, explore) as one:

@@ -4,14 +4,16 @@ import collections
 import json
 import sys
 
-from online_worlds import told
+import numpy as np
+import pytest
+from online_worlds import Spy, kick_graph, kicking, loop, told
 from stored_episodes import ROOT, output_of, script
 from stored_models import same
 
-from symgraph.learned import EpisodeStore, StochasticNetwork
+from symgraph.learned import EpisodeStore, Exploration, StochasticNetwork
 
 EPISODES = 5
-KILLS = 10
+KILLS = 9
 
 # A loop of two attempts an episode; every child runs it in the same folder, and says into a pipe what it begins:
 # an edge, a plan, a fit. The parent kills it some time after the n-th beginning of a kind. Children are forks, because
@@ -141,3 +143,56 @@ def test_a_killed_loop_ends_as_one_that_was_not(tmp_path):
         assert expected <= made <= expected + under_way
     edges = sum(what == "edge" for events in rounds for what, _ in events)
     assert edges <= EPISODES * 5 + KILLS * 5  # an episode has five edges
+
+
+def then_interrupted(function, countdown):
+    """The function, after which Ctrl-C comes when the countdown says so."""
+
+    def wrapper(*arguments, **options):
+        function(*arguments, **options)
+        if next(countdown, False):
+            raise KeyboardInterrupt
+
+    return wrapper
+
+
+@pytest.mark.parametrize("moment", ["begin", "note_plan", "add", "end", "fit", "save"])
+@pytest.mark.parametrize("anew", [False, True])
+def test_ctrl_c_just_after_something_was_done_changes_nothing(tmp_path, moment, anew):
+    """In the loop itself, as in a notebook, and in one that is made anew."""
+
+    def made(name):
+        spies = [Spy({"u": 1, "s": 1}, {"y": 1}, skill) for skill in ("near", "far")]
+        return loop(tmp_path / name, kick_graph(*spies), kicking(), 8, Exploration(1.0, 1.0, 0.1, episodes=6))
+
+    def content(one):
+        lessons = one._lessons.all.values()
+        starts = [{label: np.array(value) for label, value in start.items()} for start in one._starts(8)]
+        return (
+            told(one.store),
+            [(lesson.model.samples, np.array(lesson.x).tolist(), lesson.y) for lesson in lessons],
+            starts,
+        )
+
+    with made("whole") as one:
+        list(one)
+        expected = content(one)
+    one, interrupts = made("stopped"), 0
+    while one.done < 8:
+        places = [one.store] if hasattr(one.store, moment) else [lesson.model for lesson in one._lessons.all.values()]
+        countdown = iter([False, True])
+        for place in places:
+            setattr(place, moment, then_interrupted(getattr(place, moment), countdown))
+        try:
+            list(one)
+        except KeyboardInterrupt:
+            interrupts += 1
+        for place in places:
+            delattr(place, moment)
+        if anew:
+            one.close()
+            one = made("stopped")
+    assert interrupts >= 3
+    with one:
+        one._catch_up(8)  # as the next episode would
+        assert content(one) == expected

@@ -78,7 +78,7 @@ def falling(reads):
 def test_a_network_of_branches_learns_which_one_happened(tmp_path):
     graph, falls, slide = falling({"u": 1})
     world = Scripted({}, {"put": lambda a, s, w: {"floor": {}} if a["u"] > 0.2 else {"table": {"y": a["u"]}}})
-    with loop(tmp_path, graph, world, 25, Exploration(0.0, 1.0, 0.0, episodes=1e9)) as one:
+    with loop(tmp_path, graph, world, 16, Exploration(0.0, 1.0, 0.0, episodes=1e9)) as one:
         reports = list(one)
         lesson = one._lessons.all["falls"]
         actions = [report.actions["u"] for report in reports]
@@ -86,7 +86,7 @@ def test_a_network_of_branches_learns_which_one_happened(tmp_path):
         assert lesson.y == ["falls" if u > 0.2 else "stays" for u in actions]
         assert [report.total for report in reports] == [-1.0 if u > 0.2 else 0.0 for u in actions]
         assert len(slide.fits) == sum(u <= 0.2 for u in actions)
-    assert falls.samples == 25
+    assert falls.samples == 16
     assert falls.predict([0.9])[1] > 0.7
     assert falls.predict([-0.7])[1] < 0.3
 

@@ -139,6 +139,9 @@ class OnlineLoop:
         )
         self._lessons = Lessons(graph, {} if limits is None else limits, self.folder, seed)
         self._past: list[tuple[float, dict[str, Any]]] = []  # return and last decision of each past episode
+        # How many episodes are taken over; samples of each model and length of _past then. Changed at once, so that
+        # an exception at any moment leaves what can be gone on from.
+        self._taken = 0, self._lessons.counts(), 0
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -241,8 +244,8 @@ class OnlineLoop:
         """Run an episode, or go on with it, and learn from it."""
         stage, within = self._stage_of(number)
         (seed,) = np.random.SeedSequence([self._planning.seed, number]).generate_state(1).tolist()
+        self._catch_up(number)
         past, plans = self.store.visits(number), self.store.plans(number)
-        self._lessons.rewind()  # where an exception left the episode
         knowledge = self._knowledge()
         execution = Execution(self.graph, stage.world, knowledge, number, past)
         decider = Decider(
@@ -276,7 +279,7 @@ class OnlineLoop:
             knowledge = self._knowledge()
             knowledge.take_over(past)
             decider.recall()
-            self._lessons.rewind()
+            self._lessons.rewind(self._taken[1])
             self._lessons.fit(self._lessons.take(past, past, knowledge))
         except WorldFailed as failure:
             status, reason, observed = "failed", str(failure), failure.observed
@@ -287,8 +290,8 @@ class OnlineLoop:
         if status == "failed":
             info["observed"] = observed
         self.store.end(number, status, total=report.total, reason=reason, seconds=report.seconds, info=info)
-        self._lessons.keep()
         self._remember(status, report.total, decider.notes)
+        self._taken = number + 1, self._lessons.counts(), len(self._past)
         return report
 
     def _recall(self) -> None:
@@ -304,15 +307,21 @@ class OnlineLoop:
                     f"{self.folder / STORE}: episode {episode.number} is of stage {episode.setup!r}, but the stages "
                     f"have {wanted}; give those it was made with, or another folder"
                 )
-            if episode.status == "running":  # is gone through again, and learned from, when the loop runs
-                continue
+        self._catch_up(self._next())  # one that is running is gone through again, and learned from, by and by
+        self._lessons.fit(self._lessons.all.values())
+
+    def _catch_up(self, number: int) -> None:
+        """Take over, from the store, the episodes before a number, and nothing else."""
+        over, counts, remembered = self._taken
+        self._lessons.rewind(counts)
+        del self._past[remembered:]
+        for episode in self.store.episodes()[over:number] if over < number else ():
             visits, plans = self.store.visits(episode.number), self.store.plans(episode.number)
             knowledge = self._knowledge()
             knowledge.take_over(visits)
             self._lessons.take(visits, visits, knowledge)
             self._remember(episode.status, episode.total, plans[max(plans)] if plans else {})
-        self._lessons.keep()
-        self._lessons.fit(self._lessons.all.values())
+        self._taken = number, self._lessons.counts(), len(self._past)
 
     def _stage_of(self, number: int) -> tuple[Stage, int]:
         """Return the stage of an episode and its place in it."""

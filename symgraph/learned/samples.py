@@ -32,13 +32,11 @@ class Lesson:
         model: a network.
         x: the inputs, a row per sample.
         y: the outputs, likewise; of a model of branches the name of the one that happened.
-        kept: how many of them are of episodes that are over.
     """
 
     model: Any
     x: list[Array] = field(default_factory=list)
     y: list[Any] = field(default_factory=list)
-    kept: int = 0
 
     def fit(self, seed: int) -> None:
         """Fit the model to all samples."""
@@ -103,15 +101,14 @@ class Lessons:
                     f"know nothing; give a new model, or the folder of those episodes"
                 )
 
-    def keep(self) -> None:
-        """Keep the samples there are: an episode is over."""
-        for lesson in self.all.values():
-            lesson.kept = len(lesson.x)
+    def counts(self) -> dict[str, int]:
+        """Return how many samples each model has."""
+        return {name: len(lesson.x) for name, lesson in self.all.items()}
 
-    def rewind(self) -> None:
-        """Forget the samples of an episode that is not over: it will be gone through again."""
-        for lesson in self.all.values():
-            del lesson.x[lesson.kept :], lesson.y[lesson.kept :]
+    def rewind(self, counts: Mapping[str, int]) -> None:
+        """Forget all samples but the first so many of each model."""
+        for name, lesson in self.all.items():
+            del lesson.x[counts[name] :], lesson.y[counts[name] :]
 
     def fit(self, lessons: Iterable[Lesson]) -> None:
         """Fit the models that have not seen all of their samples, and keep each in its file."""
