@@ -12,7 +12,7 @@ from stored_models import same
 
 from symgraph.learned import EpisodeStore, Exploration, StochasticNetwork
 
-EPISODES = 5
+EPISODES = 4
 KILLS = 9
 
 # A loop of two attempts an episode; every child runs it in the same folder, and says into a pipe what it begins:

@@ -31,7 +31,7 @@ def learned(tmp_path_factory):
 
         return wrapper
 
-    one = loop(tmp_path_factory.mktemp("learned"), kick_graph(*networks((20,))), kicking(), 32, EXPLORE)
+    one = loop(tmp_path_factory.mktemp("learned"), kick_graph(*networks((20,))), kicking(), 28, EXPLORE)
     reports = []
     with pytest.MonkeyPatch.context() as patch, one:
         for report in one:
@@ -58,7 +58,7 @@ def test_it_ends_near_the_known_optimum(learned):
 
 def test_reports_say_what_happened(learned):
     one, reports, _ = learned
-    assert [report.number for report in reports] == list(range(32))
+    assert [report.number for report in reports] == list(range(28))
     assert "exploring: model 'near' has 0 of 3 samples" in reports[0].explored
     assert {r.explored for r in reports} >= {"", "drawn: selections", "drawn: actions", "drawn: selections, actions"}
     for report in reports:
@@ -72,9 +72,9 @@ def test_reports_say_what_happened(learned):
     last = reports[-1]
     assert last.explored == ""
     assert last.expected["y"] == pytest.approx(last.known["y"], abs=0.2)
-    assert str(last) == f"toy 31; skill = {last.selections['skill']}; return {last.total:.3g}"
+    assert str(last) == f"toy 27; skill = {last.selections['skill']}; return {last.total:.3g}"
     assert "; exploring: model" in str(reports[0])
-    assert last.value == one.store.plans(31)[0]["value"]
+    assert last.value == one.store.plans(27)[0]["value"]
     stored = one.store.episodes()[-1]
     assert (stored.total, stored.seed, stored.seconds) == (last.total, last.seed, last.seconds)
     assert stored.info == {"attempts": 1, "selections": last.selections, "value": last.value, "explored": ""}
@@ -87,7 +87,7 @@ def test_fits_compile_and_build_nothing(learned):
 
 def test_a_loop_that_is_over_runs_nothing(learned):
     one, _, _ = learned
-    assert (one.episodes, one.done) == (32, 32)
+    assert (one.episodes, one.done) == (28, 28)
     before = told(one.store)
     assert list(one) == []
     assert told(one.store) == before

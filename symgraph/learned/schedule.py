@@ -25,7 +25,8 @@ class World(Protocol):
         """Do what leaves a node.
 
         Returns:
-            {node reached: {label: value} observed on the way there}, one entry for each group that happened.
+            {node reached: {label: value} observed on the way there}, one entry for each group that happened; {} where
+            the graph ends and the world does not lead back.
 
         Raises:
             Exception: it failed; what was observed until then is the exception's attribute `observed`, {label: value}.
@@ -33,7 +34,7 @@ class World(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of everything."""
+        """Let go of everything; whoever made the world calls it, not the loop."""
         ...
 
 
