@@ -34,7 +34,7 @@ class World:
         return {"s": self.s}
     def execute(self, node, actions, selections):
         self.say("edge", node)
-        time.sleep(0.004)
+        time.sleep(0.01)
         if node == "aim":
             return {selections["skill"] + "_end": {"y": kick(selections["skill"], actions["u"], self.s)}}
         if node != "stopped":
@@ -60,7 +60,7 @@ def run(folder, episodes, out):
     solve, store = deciding.solve, loop.store
     def solving(*arguments, **options):
         say("plan", options["seed"])  # one for each episode and step
-        time.sleep(0.004)
+        time.sleep(0.01)
         return solve(*arguments, **options)
     deciding.solve = solving
     for network in (near, far, slide):
@@ -101,7 +101,7 @@ def events(folder, episodes, kill=None, delay=0.0):
 
 folder, episodes, kills = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
 rng = random.Random(0)
-lasts = {"edge": 0.004, "plan": 0.006, "fit": 0.2}  # [s]; roughly
+lasts = {"edge": 0.007, "plan": 0.007, "fit": 0.2}  # [s]; roughly
 whole = events(folder + "/whole", episodes)
 rounds = []
 for round in range(kills):
