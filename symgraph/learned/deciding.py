@@ -20,6 +20,7 @@ from symgraph.optimizers.problem import Optimizer
 from symgraph.plan import Plan
 from symgraph.planner import solve
 from symgraph.slots import Action
+from symgraph.tree import Tree
 
 Notes = dict[str, Any]  # what is stored of a plan
 
@@ -60,7 +61,7 @@ class Decider:
     Attributes:
         decision: the latest.
         notes: of the latest plan.
-        attempts: begun so far.
+        attempts: begun so far: at the start, and where the world has led back to.
         seconds: that planning took [s].
     """
 
@@ -83,6 +84,7 @@ class Decider:
         self._note = note
         self._fixed: dict[str, Any] = {}
         self._disturbance: dict[str, Any] = {}
+        self._ends: set[int] = set()  # steps from which the world may lead back
         self.decision: Decision = {}, {}
         self.notes: Notes = {}
         self.attempts = 0
@@ -92,24 +94,36 @@ class Decider:
         """Whether the world is asked to leave a visit's node."""
         if any(group.kind != "reward" for group in self._planning.graph.groups.get(visit.node, ())):
             return True
-        return visit.node == self._planning.again and self.attempts < self._planning.attempts
+        if visit.node != self._planning.again or self.attempts + len(self._ends) >= self._planning.attempts:
+            return False
+        self._ends.add(visit.step)
+        return True
 
     def decide(self, visit: Visit) -> Decision:
         """Return the actions and selections with which a visit's node is left."""
-        first = visit.parent is None or visit.node == self._planning.again
-        if first and visit.node in self._planning.objectives:
+        if visit.parent is None or visit.parent in self._ends:
+            self._ends.discard(-1 if visit.parent is None else visit.parent)
             self._begin_attempt()
         if visit.node in self._planning.objectives:
             begin = time.perf_counter()
             if visit.step in self._recalled:
-                self.notes = self._recalled[visit.step]
+                self._take_over(self._recalled[visit.step])
             else:
-                self.notes = self._planned(visit)
-                self._note(visit.step, self.notes)
-            actions = {k: np.array(v) if isinstance(v, list) else v for k, v in self.notes["actions"].items()}
-            self.decision = actions, dict(self.notes["selections"])
+                notes = self._planned(visit)
+                self._note(visit.step, notes)
+                self._take_over(notes)
             self.seconds += time.perf_counter() - begin
         return self.decision
+
+    def recall(self) -> None:
+        """Take over the last of the plans that were made before."""
+        if self._recalled:
+            self._take_over(self._recalled[max(self._recalled)])
+
+    def _take_over(self, notes: Notes) -> None:
+        self.notes = notes
+        actions = {k: np.array(v) if isinstance(v, list) else v for k, v in notes["actions"].items()}
+        self.decision = actions, dict(notes["selections"])
 
     def _begin_attempt(self) -> None:
         """Draw what is tried in an attempt, all of whose decisions keep to it."""
@@ -139,18 +153,22 @@ class Decider:
             seed=zlib.crc32(repr((self._planning.seed, self._number, visit.step)).encode()),
             progress=False,
         )
+        if plan.status.startswith("interrupted"):  # solve returns what it has; the loop is to stop
+            raise KeyboardInterrupt
         explores = plan.status.startswith("exploring")
-        ahead = {label for model in objective.tree.models for label in model.reads}
+        ahead = _ahead(objective.tree)
+        # What lies behind stays as it was.
         decided = {
             label: value if explores else self._disturbed(label, value)
             for label, value in plan.actions.items()
-            if label in ahead or label not in actions  # what lies behind stays as it was
+            if label in ahead or label not in actions
         }
+        selected = {label: c for label, c in plan.selections.items() if label in ahead or label not in selections}
         kinds = (("selections", list(graph.selections())), ("actions", list(graph.actions())))
         drawn = [kind for kind, labels in kinds if any(label in self._fixed for label in labels)]
         return {
             "actions": {**actions, **decided},
-            "selections": {**selections, **plan.selections},
+            "selections": {**selections, **selected},
             "planned": plan.actions,
             "value": plan.value,
             "status": plan.status,
@@ -164,6 +182,12 @@ class Decider:
             return value
         column = np.clip(value + self._disturbance[label], slot.lower, slot.upper)
         return float(column[0]) if slot.size == 1 else column
+
+
+def _ahead(tree: Tree) -> set[str]:
+    """Return the labels that something in a tree depends on."""
+    selected = {str(group.group.selection) for node in tree.nodes for group in node.groups if group.group.selection}
+    return selected.union(*(model.reads for model in tree.models))
 
 
 def _expected(plan: Plan) -> dict[str, Any]:

@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from symgraph.errors import InputError, did_you_mean, names
 from symgraph.graph import Graph
-from symgraph.learned.knowledge import Knowledge
-from symgraph.learned.records import Visit, checked_visit
+from symgraph.learned.knowledge import Knowledge, branches_to
+from symgraph.learned.records import Visit, checked_value, checked_visit, shown
 from symgraph.learned.schedule import World
 
 Decision = tuple[dict[str, Any], dict[str, str]]  # actions, selections
 
 
 class WorldFailed(Exception):
-    """A world raised; carries what was observed until then, None if it did not say."""
+    """A world failed on the way, and said what was observed until then."""
 
-    def __init__(self, node: str, error: Exception) -> None:
+    def __init__(self, node: str, error: Exception, observed: Mapping[str, Any]) -> None:
         super().__init__(f"{type(error).__name__} at node {node!r}: {error}")
-        observed = getattr(error, "observed", None)
-        self.observed: dict[str, Any] | None = dict(observed) if isinstance(observed, Mapping) else None
+        self.observed = dict(observed)
 
 
 class Diverged(Exception):
@@ -69,18 +71,24 @@ class Execution:
 
         Args:
             seed: of the world.
-            given: {label: value} of states beside what the world observes.
+            given: {label: value} of states that the world does not observe.
             decide: returns the actions and selections with which a visit's node is left.
             reached: called with the visits that an executed node has led to, and whether they are new.
             goes_on: whether the world is asked to leave a visit's node.
 
         Raises:
-            WorldFailed: the world raised.
+            WorldFailed: the world raised, on the way, an exception with an attribute `observed`. Any other comes out
+                as it is: it may be a mistake in a program.
             Diverged: the world does not lead to the past again.
             InputError: the world observed what makes no sense.
         """
-        observed = self._timed(self._graph.start, lambda: self._world.reset(seed))
-        self._arrive([self._visit(0, None, self._graph.start, {**observed, **given}, ({}, {}), 0.0)], reached)
+        start = self._graph.start
+        observed = self._timed(lambda: self._world.reset(seed))
+        if not isinstance(observed, Mapping):
+            raise InputError(f"node {start!r}: the world's reset returned {shown(observed)}; return {{label: value}}")
+        self._arrive(
+            None, [self._visit(0, None, start, {**observed, **self._checked_given(given)}, ({}, {}), 0.0)], reached
+        )
         waiting = deque(self.visits)
         while waiting:
             visit = waiting.popleft()
@@ -90,35 +98,77 @@ class Execution:
             self._knowledge.decide(visit.step, *decision)
             due = self._knowledge.reward_due(visit)
             new: list[Visit] = []
-            for node, observed in self._execute(visit.node, decision).items():
+            for node, observed in self._execute(visit, decision).items():
                 step = len(self.visits) + len(new)
                 new.append(self._visit(step, visit, node, observed, decision, 0.0 if new else due))
-            self._arrive(new, reached)
+            self._arrive(visit.step, new, reached)
             waiting.extend(new)
 
-    def _timed(self, node: str, call: Callable[[], Any]) -> Any:
+    def _timed(self, call: Callable[[], Any]) -> Any:
         begin = time.perf_counter()
         try:
             return call()
-        except Exception as error:
-            raise WorldFailed(node, error) from error
         finally:
             self.seconds += time.perf_counter() - begin
 
-    def _execute(self, node: str, decision: Decision) -> Mapping[str, Mapping[str, Any]]:
-        actions, selections = decision
-        reached = self._timed(node, lambda: self._world.execute(node, dict(actions), dict(selections)))
+    def _execute(self, visit: Visit, decision: Decision) -> Mapping[str, Mapping[str, Any]]:
+        actions, selections = copy.deepcopy(decision)  # the world may write into its own
+        try:
+            reached = self._timed(lambda: self._world.execute(visit.node, actions, selections))
+        except Exception as error:
+            observed = getattr(error, "observed", None)
+            if not isinstance(observed, Mapping):
+                raise
+            if len(self.visits) < len(self._past):
+                raise Diverged(
+                    f"the world failed where it did not before, step {visit.step}: {type(error).__name__}: {error}"
+                ) from error
+            raise WorldFailed(visit.node, error, observed) from error
+        self._check_reached(visit, reached)
+        return reached  # type: ignore[no-any-return]  # it has just been checked
+
+    def _check_reached(self, visit: Visit, reached: Any) -> None:
+        """Raise InputError where a world says what cannot be."""
+        node, nodes = visit.node, self._graph.nodes
         if not isinstance(reached, Mapping) or not all(isinstance(o, Mapping) for o in reached.values()):
             raise InputError(
-                f"node {node!r}: the world returned {reached!r}; return {{node reached: {{label: value}}}}"
+                f"node {node!r}: the world returned {shown(reached)}; return {{node reached: {{label: value}}}}"
             )
-        for target in reached:
-            if target not in self._graph.nodes:
+        unknown = [target for target in reached if target not in nodes]
+        if unknown:
+            raise InputError(
+                f"node {node!r}: the world led to {unknown[0]!r}, which is no node of the graph"
+                f"{did_you_mean(unknown[0], nodes)} Nodes: {names(nodes)}"
+            )
+        known = self._knowledge.at[visit.step]
+        ways = [target for target in nodes if branches_to(self._graph, node, target, known)]
+        if not ways:  # the graph ends here, and the world begins again somewhere
+            return
+        if not reached:
+            raise InputError(
+                f"node {node!r}: the world led nowhere; return one entry for each group that happened, of "
+                f"{names(ways)}, or raise an exception with an attribute 'observed', {{label: value}}"
+            )
+        elsewhere = [target for target in reached if target not in ways]
+        if elsewhere:
+            chosen = {label: known[label] for label in self._graph.selections() if label in known}
+            raise InputError(
+                f"node {node!r}: the world led to {elsewhere[0]!r}, to which no branch leads from there"
+                f"{f' with {chosen}' if chosen else ''}; it can lead to {names(ways)}"
+            )
+
+    def _checked_given(self, given: Any) -> Mapping[str, Any]:
+        if not isinstance(given, Mapping):
+            raise InputError(f"given = {shown(given)}; give {{label: value}}")
+        states = self._graph.states()
+        for label, value in given.items():
+            if label not in states:
+                raise InputError(f"given: {label!r} is no state{did_you_mean(label, states)} States: {names(states)}")
+            if np.size(value) != states[label].size or not np.isfinite(checked_value(value, f"given {label!r}")).all():
                 raise InputError(
-                    f"node {node!r}: the world led to {target!r}, which is no node of the graph"
-                    f"{did_you_mean(target, self._graph.nodes)} Nodes: {names(self._graph.nodes)}"
+                    f"given: {label!r} = {shown(value)}; the slot takes {states[label].size} finite numbers, give those"
                 )
-        return reached
+        return given
 
     def _visit(
         self, step: int, parent: Visit | None, node: str, observed: Mapping[str, Any], decision: Decision, due: float
@@ -128,11 +178,10 @@ class Execution:
         self._knowledge.arrive(visit, parent)
         return replace(visit, reward=due + self._knowledge.reward(visit))
 
-    def _arrive(self, new: list[Visit], reached: Callable[[list[Visit], bool], None]) -> None:
-        at = len(self.visits)
-        stored = self._past[at : at + len(new)]
+    def _arrive(self, parent: int | None, new: list[Visit], reached: Callable[[list[Visit], bool], None]) -> None:
+        stored = [visit for visit in self._past if visit.parent == parent]
         if stored and stored != new:
-            raise Diverged(f"the world did not do again what it did before, step {at}")
+            raise Diverged(f"the world did not do again what it did before, step {stored[0].step}")
         self.visits.extend(new)
         if new:
             reached(new, not stored)

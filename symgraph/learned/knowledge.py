@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from symgraph.binding import REWARD
+from symgraph.binding import REWARD, BoundModel
 from symgraph.errors import InputError, names
 from symgraph.graph import Branch, Graph, Group
-from symgraph.learned.records import Visit
+from symgraph.learned.records import Visit, shown
 from symgraph.outcomes import ModelNumbers, Moments
 from symgraph.slots import Action, Array, Selection, State
 
@@ -30,6 +30,7 @@ class Knowledge:
 
     Attributes:
         at: step → all that is known there.
+        latest: the latest of all that was observed, decided or follows from it, at whatever step.
     """
 
     def __init__(self, graph: Graph, models: ModelNumbers, decisions: Collection[str]) -> None:
@@ -37,27 +38,33 @@ class Knowledge:
         self._models = models
         self._decisions = decisions
         self.at: dict[int, Known] = {}
+        self.latest: Known = {}
 
     def arrive(self, visit: Visit, parent: Visit | None) -> None:
         """Take over what was observed on the way to a visit.
 
         Raises:
-            InputError: it does not fit the slots.
+            InputError: it does not fit the slots, or lacks what a learned model is to learn from.
         """
         for label, value in visit.observed.items():
-            slot = self._graph.slots.get(label)
+            slot, place = self._graph.slots.get(label), f"node {visit.node!r}: the world observed {label!r}"
+            if isinstance(slot, (Action, Selection)):
+                raise InputError(f"{place} = {shown(value)}, which is decided and not observed; leave it out")
             if isinstance(slot, State) and np.size(value) != slot.size:
                 raise InputError(
-                    f"node {visit.node!r}: the world observed {np.size(value)} elements of {label!r}, the slot has "
-                    f"{slot.size}"
+                    f"{place} with {np.size(value)} elements, the slot has {slot.size}; observe as many, or change "
+                    f"the slot"
                 )
-            if isinstance(slot, (Action, Selection)):
+            if isinstance(slot, State) and not np.isfinite(value).all():
                 raise InputError(
-                    f"node {visit.node!r}: the world observed {label!r}, which is decided and not observed"
+                    f"{place} = {shown(value)}, which is not finite; if that was a failure, raise an exception with an "
+                    f"attribute 'observed', {{label: value}}"
                 )
         before = {} if parent is None else self.at[parent.step]
         derived = {} if parent is None else self._derived(parent.node, visit, before)
-        self.at[visit.step] = {**before, **derived, **visit.observed}
+        new = {**derived, **visit.observed}
+        self.at[visit.step] = {**before, **new}
+        self.latest |= new
 
     def take_over(self, visits: Sequence[Visit]) -> None:
         """Take over an episode, or what there is of it."""
@@ -70,7 +77,9 @@ class Knowledge:
 
     def decide(self, step: int, actions: Mapping[str, Any], selections: Mapping[str, str]) -> None:
         """Take over what was decided at a step."""
-        self.at[step] = {**self.at[step], **actions, **selections}
+        new = {**actions, **selections}
+        self.at[step] = {**self.at[step], **new}
+        self.latest |= new
 
     def reward(self, visit: Visit) -> float:
         """Return what is paid on arrival at a visit."""
@@ -81,8 +90,15 @@ class Knowledge:
         return self._reward(visit, late=True)
 
     def _derived(self, node: str, visit: Visit, before: Known) -> Known:
-        found = branch_to(self._graph, node, visit.node, before)
-        model = found[1].model if found is not None else None
+        found = branches_to(self._graph, node, visit.node, before)
+        for group, branch in found:
+            if isinstance(group.probability, BoundModel) and group.probability.learner is not None:
+                _check_sample(group.probability, before, (), visit)
+            if branch.model is not None and branch.model.learner is not None:
+                _check_sample(branch.model, before, tuple(branch.model.writes), visit)
+        if len({id(branch.model) for _, branch in found}) != 1:  # of several nobody knows which one it was
+            return {}
+        model = found[0][1].model
         if model is None or model.learner is not None or all(label in visit.observed for label in model.writes):
             return {}
         if any(label not in before for label in model.reads):
@@ -122,21 +138,31 @@ def column_of(graph: Graph, label: str, value: Any) -> Array:
     return np.atleast_1d(np.asarray(value, dtype=float))
 
 
-def branch_to(graph: Graph, node: str, target: str, known: Mapping[str, Any]) -> tuple[Group, Branch] | None:
-    """Return the branch that led from a node to another, and its group; None if the graph has none.
-
-    Raises:
-        InputError: several branches lead there, and it matters which one it was.
-    """
-    found = [
+def branches_to(graph: Graph, node: str, target: str, known: Mapping[str, Any]) -> list[tuple[Group, Branch]]:
+    """Return the branches, each with its group, that can have led from a node to another under what was selected."""
+    return [
         (group, branch)
         for group in graph.groups.get(node, ())
         for branch in group.branches
         if branch.target == target and (group.kind != "choose" or branch.label == known.get(str(group.selection)))
     ]
-    if len({id(branch.model) for _, branch in found}) > 1 and any(b.model and b.model.learner for _, b in found):
-        raise InputError(
-            f"node {node!r}: {names(branch.label for _, branch in found)} all lead to {target!r}, so that nobody can "
-            f"tell which of them is to learn from it; give each a node of its own"
-        )
-    return found[0] if found else None
+
+
+def _check_sample(model: BoundModel, before: Known, written: Sequence[str], visit: Visit) -> None:
+    """Raise InputError where a learned model that has led to a visit cannot learn from it."""
+    for label in model.reads:
+        if label not in before:
+            raise InputError(
+                f"{model.place} learns from {label!r}, which was not observed before; known are {names(before)}"
+            )
+        if not isinstance(before[label], str) and not np.isfinite(before[label]).all():
+            raise InputError(
+                f"{model.place} cannot learn from {label!r} = {shown(before[label])}; observe it, or mend the model it "
+                f"follows from"
+            )
+    for label in written:
+        if label not in visit.observed:  # what was known before says nothing of what the edge did
+            raise InputError(
+                f"{model.place} learns {label!r}, which was not observed on the way to {visit.node!r}; observed were "
+                f"{names(visit.observed)}"
+            )

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from symgraph.errors import InputError, did_you_mean, names
+from symgraph.errors import InputError, StorageError, did_you_mean, names
 from symgraph.graph import Graph
 from symgraph.learned.deciding import Decider, Notes, Planning
 from symgraph.learned.episodes import EpisodeStore
 from symgraph.learned.execution import Diverged, Execution, WorldFailed
+from symgraph.learned.inputs import checked_count
 from symgraph.learned.knowledge import Knowledge, Known
-from symgraph.learned.records import Visit
+from symgraph.learned.records import Visit, checked_whole, shown
 from symgraph.learned.samples import Lessons
 from symgraph.learned.schedule import Exploration, Stage, World
+from symgraph.learned.storage import checked_path
 from symgraph.objective import Objective
 from symgraph.optimizers.problem import Optimizer
 from symgraph.outcomes import ModelNumbers
@@ -41,13 +42,14 @@ class EpisodeReport:
         status: "done", "failed" or "interrupted".
         reason: why it failed, else empty.
         total: the return, the sum of its rewards.
-        attempts: how often the graph was gone through.
+        attempts: how often the graph was gone through, at least to its first node.
         actions: {label: value} decided last.
         selections: {label: choice} decided last.
         expected: {label: mean} of what the last plan promised.
         value: that the last plan promised.
-        explored: why the last decision was not the best plan, e.g. "drawn: skill"; empty if it was.
-        known: {label: value} of all that was observed, the latest.
+        explored: why the last decision was not the best plan, "drawn: selections, actions" or "exploring: …"; empty if
+            it was, but for noise.
+        known: {label: value} of all that was observed, decided or follows from it, the latest.
         seconds: {"simulating", "planning", "fitting": time} [s].
     """
 
@@ -86,7 +88,8 @@ class OnlineLoop:
         stages: which worlds, for how many episodes, see `Stage`.
         folder: of the files; made if it is not there.
         decisions: nodes at which is planned anew, beside the graph's start.
-        again: a node at which the graph ends but from which the world may lead back to an earlier one.
+        again: a node at which the graph ends but from which the world may lead back to an earlier one; make that one
+            of `decisions`.
         attempts: how often the graph is gone through in an episode, at most.
         optimizer: of the plans, `solve`'s default if left out.
         limits: {label: (low, high)}: values beyond are clipped before they are learned from; rare accidents would
@@ -119,14 +122,12 @@ class OnlineLoop:
             raise InputError(f"stages = {stages!r}; give a list of Stage")
         self.graph = graph
         self.stages = tuple(stages)
-        self.folder = Path(folder)
-        self.decisions = tuple(dict.fromkeys((graph.start, *decisions)))
-        for node in (*self.decisions, *([] if again is None else [again])):
-            if node not in graph.nodes:
-                raise InputError(
-                    f"{node!r} is no node of the graph{did_you_mean(node, graph.nodes)} Nodes: {names(graph.nodes)}"
-                )
-        self._remembered = remembered
+        self.folder = checked_path(folder)
+        self.decisions = tuple(dict.fromkeys((graph.start, *_checked_nodes(graph, decisions, again))))
+        attempts = checked_count(attempts, "attempts")
+        if again is None and attempts > 1:
+            raise InputError(f"attempts = {attempts}, but nothing leads back; say with `again` where an attempt ends")
+        seed, self._remembered = checked_whole(seed, "seed"), checked_whole(remembered, "remembered")
         self._models = ModelNumbers()
         self._planning = Planning(
             graph,
@@ -136,9 +137,15 @@ class OnlineLoop:
             attempts,
             seed,
         )
-        self._lessons = Lessons(graph, limits or {}, self.folder, seed)
+        self._lessons = Lessons(graph, {} if limits is None else limits, self.folder, seed)
         self._past: list[tuple[float, dict[str, Any]]] = []  # return and last decision of each past episode
-        self.folder.mkdir(parents=True, exist_ok=True)
+        # How many episodes are taken over; samples of each model and length of _past then. Changed at once, so that
+        # an exception at any moment leaves what can be gone on from.
+        self._taken = 0, self._lessons.counts(), 0
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StorageError(f"folder {self.folder} cannot be made: {error.strerror}; give another") from None
         self.store = EpisodeStore(self.folder / STORE)
         try:
             self.store.set_settings(self.settings)
@@ -155,7 +162,7 @@ class OnlineLoop:
     @property
     def done(self) -> int:
         """How many of them are over."""
-        return sum(episode.status != "running" for episode in self.store.episodes())
+        return len(self.store) - len(self.store.episodes(status="running"))
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -185,12 +192,19 @@ class OnlineLoop:
         """
         node = self.graph.start if node is None else node
         if node not in self.decisions:
-            raise InputError(f"nothing is planned at {node!r}{did_you_mean(node, self.decisions)}")
+            raise InputError(
+                f"nothing is planned at {node!r}{did_you_mean(node, self.decisions)} Decisions are made at: "
+                f"{names(self.decisions)}"
+            )
+        if not isinstance(known, Mapping):
+            raise InputError(f"known = {shown(known)}; give {{label: value}}")
         state = {label: known[label] for label in self.graph.states() if label in known}
         return solve(self._planning.objectives[node], state, self._planning.optimizer, progress=False)
 
     def perform(self, world: World, seed: int, given: Mapping[str, Any] | None = None) -> EpisodeReport:
         """Run an episode with the best plans; nothing is tried, learned or stored.
+
+        While a model has too few samples, the plans are random, and the report's `explored` says so.
 
         Args:
             world: where.
@@ -202,7 +216,9 @@ class OnlineLoop:
         execution = Execution(self.graph, world, knowledge, 0)
         status, reason = "done", ""
         try:
-            execution.run(seed, given or {}, decider.decide, lambda visits, new: None, decider.goes_on)
+            execution.run(
+                seed, {} if given is None else given, decider.decide, lambda visits, new: None, decider.goes_on
+            )
         except WorldFailed as failure:
             status, reason = "failed", str(failure)
         return _report(
@@ -221,13 +237,14 @@ class OnlineLoop:
 
     def _next(self) -> int:
         """Return the number of the episode that is to be run, or gone on with."""
-        told = self.store.episodes()
-        return next((episode.number for episode in told if episode.status == "running"), len(told))
+        running = self.store.episodes(status="running")
+        return running[0].number if running else len(self.store)
 
     def _learn(self, number: int) -> EpisodeReport:
         """Run an episode, or go on with it, and learn from it."""
         stage, within = self._stage_of(number)
         (seed,) = np.random.SeedSequence([self._planning.seed, number]).generate_state(1).tolist()
+        self._catch_up(number)
         past, plans = self.store.visits(number), self.store.plans(number)
         knowledge = self._knowledge()
         execution = Execution(self.graph, stage.world, knowledge, number, past)
@@ -254,31 +271,34 @@ class OnlineLoop:
             fitting += time.perf_counter() - begin
 
         status, reason, visits = "done", "", execution.visits
-        observed: dict[str, Any] | None = None
+        observed: dict[str, Any] = {}
         try:
             execution.run(seed, stage.given_at(within), decider.decide, reached, decider.goes_on)
         except Diverged as error:
-            status, reason = "interrupted", str(error)
-            knowledge, gone_through, visits = self._knowledge(), len(visits), past
+            status, reason, visits = "interrupted", str(error), past
+            knowledge = self._knowledge()
             knowledge.take_over(past)
-            self._lessons.fit(self._lessons.take(past, past[gone_through:], knowledge))
+            decider.recall()
+            self._lessons.rewind(self._taken[1])
+            self._lessons.fit(self._lessons.take(past, past, knowledge))
         except WorldFailed as failure:
-            if failure.observed is None or not visits:  # a mistake in a program, for all anybody knows
-                raise (failure.__cause__ or failure) from None
             status, reason, observed = "failed", str(failure), failure.observed
         report = _report(
             number, stage.name, seed, status, reason, visits, knowledge, decider, execution.seconds, fitting
         )
         info = {name: getattr(report, name) for name in ("attempts", "selections", "value", "explored")}
-        if observed is not None:
+        if status == "failed":
             info["observed"] = observed
         self.store.end(number, status, total=report.total, reason=reason, seconds=report.seconds, info=info)
-        self._remember(report.total, decider.notes)
+        self._remember(status, report.total, decider.notes)
+        self._taken = number + 1, self._lessons.counts(), len(self._past)
         return report
 
     def _recall(self) -> None:
         """Take over what the folder holds."""
         self._lessons.restore()
+        if not len(self.store):
+            self._lessons.check_unfitted()
         for episode in self.store.episodes():
             stage = self._stage_of(episode.number)[0] if episode.number < self.episodes else None
             if stage is None or stage.name != episode.setup:
@@ -287,15 +307,21 @@ class OnlineLoop:
                     f"{self.folder / STORE}: episode {episode.number} is of stage {episode.setup!r}, but the stages "
                     f"have {wanted}; give those it was made with, or another folder"
                 )
-            if episode.status == "running":  # is gone through again, and learned from, when the loop runs
-                continue
+        self._catch_up(self._next())  # one that is running is gone through again, and learned from, by and by
+        self._lessons.fit(self._lessons.all.values())
+
+    def _catch_up(self, number: int) -> None:
+        """Take over, from the store, the episodes before a number, and nothing else."""
+        over, counts, remembered = self._taken
+        self._lessons.rewind(counts)
+        del self._past[remembered:]
+        for episode in self.store.episodes()[over:number] if over < number else ():
             visits, plans = self.store.visits(episode.number), self.store.plans(episode.number)
             knowledge = self._knowledge()
             knowledge.take_over(visits)
             self._lessons.take(visits, visits, knowledge)
-            if episode.total is not None:
-                self._remember(episode.total, plans[max(plans)] if plans else {})
-        self._lessons.fit(self._lessons.all.values())
+            self._remember(episode.status, episode.total, plans[max(plans)] if plans else {})
+        self._taken = number, self._lessons.counts(), len(self._past)
 
     def _stage_of(self, number: int) -> tuple[Stage, int]:
         """Return the stage of an episode and its place in it."""
@@ -308,8 +334,9 @@ class OnlineLoop:
     def _knowledge(self) -> Knowledge:
         return Knowledge(self.graph, self._models, self.decisions)
 
-    def _remember(self, total: float, notes: Notes) -> None:
-        if notes:
+    def _remember(self, status: str, total: float | None, notes: Notes) -> None:
+        # An episode that ended early may not have come to what it would have been punished for.
+        if status == "done" and notes and total is not None and np.isfinite(total):
             self._past.append((total, {**notes["actions"], **notes["selections"]}))
 
     def _starts(self, number: int) -> list[dict[str, Any]]:
@@ -317,6 +344,20 @@ class OnlineLoop:
         better = sorted(self._past, key=lambda one: -one[0])[: (len(self._past) + 1) // 2]
         rng = np.random.default_rng([self._planning.seed, number])
         return [better[i][1] for i in rng.permutation(len(better))[: self._remembered]]
+
+
+def _checked_nodes(graph: Graph, decisions: Any, again: Any) -> list[str]:
+    """Return the nodes of decisions; raise InputError where the graph has no such nodes."""
+    if isinstance(decisions, str) or not isinstance(decisions, Iterable):
+        raise InputError(f"decisions = {decisions!r}; give a list of nodes")
+    nodes = list(decisions)
+    for place, node in [*(("decisions", node) for node in nodes), *([] if again is None else [("again", again)])]:
+        if node not in graph.nodes:
+            hint = did_you_mean(node, graph.nodes)
+            raise InputError(f"{place}: {node!r} is no node of the graph{hint} Nodes: {names(graph.nodes)}")
+    if any(group.kind != "reward" for group in graph.groups.get(again, ())):
+        raise InputError(f"again: branches lead on from {again!r}; give a node at which the graph ends")
+    return nodes
 
 
 def _report(
@@ -331,9 +372,6 @@ def _report(
     simulating: float,
     fitting: float,
 ) -> EpisodeReport:
-    known: Known = {}
-    for visit in visits:
-        known |= knowledge.at[visit.step]
     actions, selections = decider.decision
     return EpisodeReport(
         number=number,
@@ -348,6 +386,6 @@ def _report(
         expected=decider.notes.get("expected", {}),
         value=decider.notes.get("value", float("nan")),
         explored=decider.notes.get("explored", ""),
-        known=known,
+        known=knowledge.latest,
         seconds={"simulating": simulating, "planning": decider.seconds, "fitting": fitting},
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,12 +13,15 @@ from typing import Any
 import numpy as np
 
 from symgraph.binding import BoundModel
-from symgraph.errors import InputError, names
-from symgraph.graph import Graph
+from symgraph.errors import InputError, did_you_mean, names
+from symgraph.graph import Branch, Graph, Group
 from symgraph.learned.branches import BranchNetwork
-from symgraph.learned.knowledge import Knowledge, Known, branch_to, column_of
+from symgraph.learned.knowledge import Knowledge, Known, branches_to, column_of
 from symgraph.learned.records import Visit
 from symgraph.slots import Array
+
+# What a model that can be fitted must have beside `fit`, `reads`, `writes` and `propagate`.
+NEEDED = ("name", "parameters", "samples", "save", "restore", "settings")
 
 
 @dataclass(eq=False)
@@ -50,31 +54,61 @@ class Lessons:
         seed: of the fits.
 
     Raises:
-        InputError: two models of the same name, limits of what is no state.
+        InputError: two models of the same name or file, a model that lacks something, branches that nobody can tell
+            apart, limits that do not fit.
     """
 
     def __init__(self, graph: Graph, limits: Mapping[str, tuple[float, float]], folder: Path, seed: int) -> None:
         self._graph = graph
-        self._limits = dict(limits)
+        self._limits = _checked_limits(limits, graph)
         self._folder = folder
         self._seed = seed
         self.all: dict[str, Lesson] = {}  # by the model's name
-        for label in limits:
-            if label not in graph.states():
-                raise InputError(f"limits: {label!r} is no state. States: {names(graph.states())}")
         for bound in _bound_models(graph):
             model = bound.learner
             if model is None:
                 continue
+            lacks = [name for name in NEEDED if not hasattr(model, name)]
+            if lacks or not model.parameters:
+                raise InputError(
+                    f"{bound.place} has a method 'fit' but no {(lacks or ['parameters'])[0]!r}; see StochasticNetwork, "
+                    f"or take 'fit' away to use it as it is"
+                )
             known = self.all.setdefault(model.name, Lesson(model))
             if known.model.parameters[0] is not model.parameters[0]:  # a view under another rule shares its weights
                 raise InputError(f"two learned models are named {model.name!r}; give each a name of its own")
+        files = {self.file_of(name): name for name in self.all}
+        for name in self.all:
+            if files[self.file_of(name)] != name:
+                raise InputError(
+                    f"learned models {name!r} and {files[self.file_of(name)]!r} would both be kept in "
+                    f"{self.file_of(name).name}; give them names that differ in letters or digits"
+                )
+        _check_told_apart(graph)
 
     def restore(self) -> None:
         """Take over the models that the folder holds."""
         for name, lesson in self.all.items():
             if self.file_of(name).exists():
                 lesson.model.restore(self.file_of(name))
+
+    def check_unfitted(self) -> None:
+        """Raise InputError where a model has seen samples that no episode holds."""
+        for name, lesson in self.all.items():
+            if lesson.model.samples:
+                raise InputError(
+                    f"model {name!r} has seen {lesson.model.samples} samples, of which the episodes in {self._folder} "
+                    f"know nothing; give a new model, or the folder of those episodes"
+                )
+
+    def counts(self) -> dict[str, int]:
+        """Return how many samples each model has."""
+        return {name: len(lesson.x) for name, lesson in self.all.items()}
+
+    def rewind(self, counts: Mapping[str, int]) -> None:
+        """Forget all samples but the first so many of each model."""
+        for name, lesson in self.all.items():
+            del lesson.x[counts[name] :], lesson.y[counts[name] :]
 
     def fit(self, lessons: Iterable[Lesson]) -> None:
         """Fit the models that have not seen all of their samples, and keep each in its file."""
@@ -95,9 +129,6 @@ class Lessons:
             visits: of the episode so far, by their steps.
             new: those to learn from.
             knowledge: of the episode.
-
-        Raises:
-            InputError: something that a model learns from was not observed.
         """
         grown: dict[int, Lesson] = {}
         for visit in new:
@@ -110,10 +141,10 @@ class Lessons:
     def _take(self, node: str, before: Known, target: str, after: Known) -> list[Lesson]:
         """Add what the step from one node to another has to teach; return the lessons that have grown."""
         grown = []
-        found = branch_to(self._graph, node, target, before)
-        if found is None:  # the world leads back to an earlier node: no edge of the graph
+        found = branches_to(self._graph, node, target, before)
+        if not found:  # the world leads back to an earlier node: no edge of the graph
             return []
-        group, branch = found
+        group, branch = found[0]  # if it learns, there is no other, see _check_told_apart
         if isinstance(group.probability, BoundModel) and group.probability.learner is not None:
             lesson = self.all[group.probability.learner.name]
             lesson.x.append(self._stacked(group.probability, lesson.model.reads, before))
@@ -123,28 +154,67 @@ class Lessons:
             model = branch.model
             lesson = self.all[model.learner.name]
             x = self._stacked(model, lesson.model.reads, before)
-            y = [self._clipped(model, model.targets[name], after) for name in lesson.model.writes]
+            y = [self._clipped(model.targets[name], after) for name in lesson.model.writes]
             lesson.x.append(x)
             lesson.y.append(np.concatenate(y))
             grown.append(lesson)
         return grown
 
     def _stacked(self, bound: BoundModel, reads: Iterable[str], known: Known) -> Array:
-        return np.concatenate([self._column(bound, bound.sources[name], known, "reads") for name in reads])
+        labels = [bound.sources[name] for name in reads]
+        return np.concatenate([column_of(self._graph, label, known[label]) for label in labels])
 
-    def _clipped(self, bound: BoundModel, label: str, known: Known) -> Array:
-        column = self._column(bound, label, known, "writes")
+    def _clipped(self, label: str, known: Known) -> Array:
+        column = column_of(self._graph, label, known[label])
         return np.clip(column, *self._limits[label]) if label in self._limits else column
-
-    def _column(self, bound: BoundModel, label: str, known: Known, what: str) -> Array:
-        if label not in known:
-            raise InputError(f"{bound.place} {what} {label!r}, which was not observed; known are {names(known)}")
-        return column_of(self._graph, label, known[label])
 
 
 def _bound_models(graph: Graph) -> Iterable[BoundModel]:
+    """Return the models that can be taught: rewards are computed, not observed."""
     for groups in graph.groups.values():
         for group in groups:
+            if group.kind == "reward":
+                continue
             if isinstance(group.probability, BoundModel):
                 yield group.probability
             yield from (branch.model for branch in group.branches if branch.model is not None)
+
+
+def _checked_limits(limits: Any, graph: Graph) -> dict[str, tuple[Any, Any]]:
+    """Return {label: (low, high)}; raise InputError where it is none of the graph's states."""
+    if not isinstance(limits, Mapping):
+        raise InputError(f"limits = {limits!r}; give {{label: (low, high)}}")
+    for label, pair in limits.items():
+        states = graph.states()
+        if label not in states:
+            raise InputError(f"limits: {label!r} is no state{did_you_mean(label, states)} States: {names(states)}")
+        try:
+            low, high = (np.broadcast_to(np.asarray(bound, dtype=float), states[label].size) for bound in pair)
+            fits = bool((low <= high).all())
+        except (TypeError, ValueError):
+            fits = False
+        if not fits:
+            raise InputError(f"limits of {label!r} = {pair!r}; give (low, high), numbers or one for each element")
+    return dict(limits)
+
+
+def _check_told_apart(graph: Graph) -> None:
+    """Raise InputError where several branches lead to one node and it matters to a model which one it was."""
+    for node, groups in graph.groups.items():
+        branches = [(group, branch) for group in groups for branch in group.branches if branch.target is not None]
+        for (group, one), (other_group, other) in itertools.combinations(branches, 2):
+            exclusive = group.selection is not None and group.selection == other_group.selection
+            if one.target != other.target or (exclusive and one.label != other.label):
+                continue
+            if _learned_from(group, one) != _learned_from(other_group, other):
+                raise InputError(
+                    f"node {node!r}: {names((one.label, other.label))} lead to {one.target!r}, so that nobody can tell "
+                    f"which of them is to learn from it; give each a node of its own"
+                )
+
+
+def _learned_from(group: Group, branch: Branch) -> tuple[Any, ...]:
+    """Return what is learned where a branch happens."""
+    chance = group.probability
+    taught = branch.label if isinstance(chance, BoundModel) and chance.learner is not None else None
+    return taught, branch.model if branch.model is not None and branch.model.learner is not None else None

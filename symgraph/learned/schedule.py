@@ -25,7 +25,8 @@ class World(Protocol):
         """Do what leaves a node.
 
         Returns:
-            {node reached: {label: value} observed on the way there}, one entry for each group that happened.
+            {node reached: {label: value} observed on the way there}, one entry for each group that happened; {} where
+            the graph ends and the world does not lead back.
 
         Raises:
             Exception: it failed; what was observed until then is the exception's attribute `observed`, {label: value}.
@@ -33,7 +34,7 @@ class World(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of everything."""
+        """Let go of everything; whoever made the world calls it, not the loop."""
         ...
 
 
@@ -62,7 +63,7 @@ class Exploration:
     def __post_init__(self) -> None:
         for name, most in (("selections", 1.0), ("actions", 1.0), ("noise", 1.0), ("episodes", math.inf)):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= most:
+            if isinstance(value, bool) or not isinstance(value, (int, float, np.integer)) or not 0 <= value <= most:
                 raise InputError(f"Exploration: {name} = {value!r}; give a number from 0 to {most:g}")
 
     def at(self, episode: int) -> Exploration:
@@ -103,6 +104,10 @@ class Stage:
                 )
         if isinstance(self.episodes, bool) or not isinstance(self.episodes, (int, np.integer)) or self.episodes < 1:
             raise InputError(f"stage {self.name!r}: episodes = {self.episodes!r}; give a positive whole number")
+        if not isinstance(self.given, Mapping) and not callable(self.given):
+            raise InputError(
+                f"stage {self.name!r}: given is {self.given!r}; give {{label: value}}, or a function of it"
+            )
         if not isinstance(self.explore, Exploration):
             raise InputError(f"stage {self.name!r}: explore is {self.explore!r}; give an Exploration")
 
