@@ -25,7 +25,14 @@ EXCESS_WEIGHT = 1.0  # of the squared amount that is too much
 MOVE_WEIGHT = 0.1  # of the squared way to the pouring position [1/length^2]
 
 # What the learned models read; all but the actions are observed before a trial.
-BEFORE_POURING = {"grasp_height": 1, "relative_position": 3, "target_change": 1, "receiver_size": 3, "mouth": 1}
+BEFORE_POURING = {
+    "grasp_height": 1,
+    "relative_position": 3,
+    "target_change": 1,
+    "receiver_size": 3,
+    "mouth": 1,
+    "released": 1,  # by earlier attempts, of 0.55 in all
+}
 MATERIAL = {"material": 4}
 FLOW = {"released_change": 1, "flow_centre": 2, "flow_variance": 1}
 
@@ -166,7 +173,7 @@ def flow_network(skill: str, **options: Any) -> sg.learned.StochasticNetwork:
     if skill not in actions:
         raise ValueError(f"skill is {skill!r}; choose from {list(SKILLS)}")
     reads = {**BEFORE_POURING, **MATERIAL, **actions[skill]}
-    resolution = {**RESOLUTION, "grasp_height": 0.01, "mouth": 0.003}
+    resolution = {**RESOLUTION, "grasp_height": 0.01, "mouth": 0.003, "released": 0.005}
     settings = {"name": f"F_flow_{skill}", "resolution": resolution, **NETWORK, **options}
     return sg.learned.StochasticNetwork(reads, FLOW, **settings)
 
@@ -213,6 +220,7 @@ def graph(flow_tip: Any, flow_shake: Any, amount: Any, *, shaped: bool = False) 
         "relative_position": sg.State(3, unit=length),
         "mouth": sg.State(unit=length),
         "material": sg.State(4),
+        "released": sg.State(unit="amount"),
         "released_change": sg.State(unit="amount"),
         "flow_centre": sg.State(2, unit=length),
         "flow_variance": sg.State(unit="length^2"),
