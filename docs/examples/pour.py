@@ -51,22 +51,19 @@ PROOFS = 6  # situations at the end that it has never met
 # ---------------------
 # ``models/pouring.py`` holds the graph of the paper's figure 8: grasp, move to the receiver, move to the pouring
 # position, choose a skill, pour. How each skill makes spheres flow, and how a flow fills the receiver, is left to three
-# networks. The loop plans, pours, stores what happened, fits the networks whose edges ran, and goes on.
+# networks. The loop plans, pours, stores what happened, fits the networks whose edges ran, and goes on. If too little
+# was poured it tries again, up to four times in an episode.
 
 
 def loop_in(world, setup, episodes, seed, folder):
     graph = pouring.graph(pouring.flow_network("tip"), pouring.flow_network("shake"), pouring.amount_network())
     return sg.learned.OnlineLoop(
         graph,
-        [
-            sg.learned.Stage(
-                setup, world, episodes, sg.learned.Exploration(selections=1.0, actions=1.0, episodes=0.6 * episodes)
-            )
-        ],
+        [sg.learned.Stage(setup, world, episodes, sg.learned.Exploration(episodes=0.6 * episodes))],
         folder,
-        decisions=pouring.DECISIONS,
+        **pouring.TRIALS,
         limits=pouring.LIMITS,
-        optimizer=sg.Lbfgs(starts=8, iterations=100),
+        optimizer=sg.Lbfgs(starts=8, iterations=60),
         seed=seed,
     )
 
@@ -75,8 +72,8 @@ def loop_in(world, setup, episodes, seed, folder):
 # What it tells
 # -------------
 
-HEADS = ["material", "mouth", "skill", "poured / target", "spilled", "return"]
-WIDTHS = [8, 5, 5, 15, 7, 8]
+HEADS = ["material", "mouth", "skill", "attempts", "poured / target", "spilled", "return"]
+WIDTHS = [8, 5, 5, 8, 15, 7, 8]
 
 
 def aligned(cells):
@@ -90,8 +87,9 @@ def told(episode):
             name_of(seen["material"]),
             f"{seen['mouth']:.2f}",
             episode.selections["skill"],
-            f"{seen['poured_change']:.3f} / {seen['target']:.3f}",
-            f"{seen['spilled_change'] / 0.1:.0f}",
+            f"{episode.attempts}",
+            f"{seen['target'] - seen['target_change'] + seen['poured_change']:.3f} / {seen['target']:.3f}",
+            f"{(seen['spilled'] + seen['spilled_change']) / 0.1:.0f}",
             f"{episode.total:.2f}",
         ]
     )
@@ -149,7 +147,7 @@ def draw_curve(loop, folder):
             at = (skills == skill) & (explored == tried)
             label = f"{skill}, {'explored' if tried else 'planned'}"
             shade = "none" if tried else colour
-            axes.scatter(np.flatnonzero(at) + 1, returns[at], 25, shade, marker, edgecolors=colour, label=label)
+            axes.scatter(np.flatnonzero(at) + 1, returns[at], marker=marker, c=shade, edgecolors=colour, label=label)
     axes.set(yscale="symlog", xlabel="episode", ylabel="return", title="Learning to pour")
     axes.legend(ncols=2, fontsize="small")
     figure.savefig(folder / "learning_curve.png", dpi=150)

@@ -55,8 +55,8 @@ class Exploration:
         InputError: a number outside its range.
     """
 
-    selections: float = 0.5
-    actions: float = 0.5
+    selections: float = 1.0
+    actions: float = 1.0
     noise: float = 0.1
     episodes: int = 50
 

@@ -117,7 +117,7 @@ def task() -> tuple[sg.Graph, ModelNumbers]:
 def attempt(world: PouringWorld, seed: int, skill: str, actions: Actions) -> dict[str, Any]:
     """Pour once, with the rewards that an on-line loop would get; return the columns from "status" on."""
     graph, models = task()
-    knowledge = Knowledge(graph, models, pouring.DECISIONS)
+    knowledge = Knowledge(graph, models, pouring.TRIALS["decisions"])
     execution = Execution(graph, world, knowledge, 0)
     decision = {"grasp_ratio": GRASP, **actions}, {"skill": skill}
     status, observed = "done", {}

@@ -156,9 +156,9 @@ class Run:
             pouring.graph(*networks, shaped=True),
             self.condition.stages,
             self.folder,
-            decisions=pouring.DECISIONS,
+            **pouring.TRIALS,
             limits=pouring.LIMITS,
-            optimizer=sg.Lbfgs(starts=8, iterations=100),
+            optimizer=sg.Lbfgs(starts=8, iterations=60),
             seed=self.number,
         )
 
@@ -240,9 +240,10 @@ def outcome(known: Mapping[str, Any], skill: str, total: float) -> dict[str, Any
         "target": known["target"],
         "receiver_length": length,
         "receiver_height": height,
-        "poured": known.get("poured_change", math.nan),
-        "spilled": known.get("spilled_change", math.nan),
-        "released": known.get("released_change", math.nan),
+        # Those of the last attempt, and what earlier ones had poured, spilled and let out.
+        "poured": known["target"] - known["target_change"] + known.get("poured_change", math.nan),
+        "spilled": known["spilled"] + known.get("spilled_change", math.nan),
+        "released": known["released"] + known.get("released_change", math.nan),
         "return": total,
     }
     named = {"material": name_of(known["material"]), "skill": skill}
