@@ -55,6 +55,7 @@ class Decider:
         number: of the episode.
         explore: how much is tried in this episode.
         starts: decisions of other episodes, to start searches from.
+        rare: {selection: the choices made least often so far}, which are drawn from.
         recalled: {step: notes} of plans that were made before.
         note: called with the step and the notes of every new plan.
 
@@ -72,6 +73,7 @@ class Decider:
         number: int,
         explore: Exploration,
         starts: Sequence[Mapping[str, Any]] = (),
+        rare: Mapping[str, Sequence[str]] | None = None,
         recalled: Mapping[int, Notes] | None = None,
         note: Callable[[int, Notes], None] = lambda step, notes: None,
     ) -> None:
@@ -80,6 +82,7 @@ class Decider:
         self._number = number
         self._explore = explore
         self._starts = list(starts)
+        self._rare = rare or {}
         self._recalled = recalled or {}
         self._note = note
         self._fixed: dict[str, Any] = {}
@@ -131,7 +134,9 @@ class Decider:
         rng = np.random.default_rng([self._planning.seed, self._number, self.attempts])
         self.attempts += 1
         draws_selections, draws_actions = rng.random(2) < (self._explore.selections, self._explore.actions)
-        selections = {label: str(rng.choice(slot.choices)) for label, slot in graph.selections().items()}
+        selections = {
+            label: str(rng.choice(self._rare.get(label, slot.choices))) for label, slot in graph.selections().items()
+        }
         actions = {label: rng.uniform(slot.lower, slot.upper) for label, slot in graph.actions().items()}
         self._fixed = {**(selections if draws_selections else {}), **(actions if draws_actions else {})}
         self._disturbance = {

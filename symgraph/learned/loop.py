@@ -254,6 +254,7 @@ class OnlineLoop:
             number,
             stage.explore.at(within),
             self._starts(number),
+            self._rare(),
             plans,
             lambda step, notes: self.store.note_plan(number, step, notes),
         )
@@ -344,6 +345,15 @@ class OnlineLoop:
         better = sorted(self._past, key=lambda one: -one[0])[: (len(self._past) + 1) // 2]
         rng = np.random.default_rng([self._planning.seed, number])
         return [better[i][1] for i in rng.permutation(len(better))[: self._remembered]]
+
+    def _rare(self) -> dict[str, list[str]]:
+        """Return the choices of each selection that were made least often, so that no skill stays unknown."""
+        rare = {}
+        for label, slot in self.graph.selections().items():
+            made = [decided.get(label) for _, decided in self._past]
+            fewest = min(made.count(choice) for choice in slot.choices)
+            rare[label] = [choice for choice in slot.choices if made.count(choice) == fewest]
+        return rare
 
 
 def _checked_nodes(graph: Graph, decisions: Any, again: Any) -> list[str]:
