@@ -155,12 +155,14 @@ def test_quadrature_is_exact_to_its_degree(directions, degree, seed):
     rng = np.random.default_rng(seed)
     m, s, a = rng.normal(size=directions), random_covariance(rng, directions), rng.normal(size=directions)
     exact = normal_moments(*linear_form(a, m, s), 2 * degree)
-    sizes = normal_moments(abs(a @ m), a @ s @ a, 2 * degree)
+    sizes = normal_moments(abs(a) @ abs(m), abs(a) @ abs(s) @ abs(a), 2 * degree)  # the sums themselves may cancel
     for k in (1, 2, degree // 2, degree):
         mean, covariance = moments("quadrature", lambda x, k=k: ca.mtimes(ca.DM(a).T, x) ** k, {"x": (m, s)})
         assert abs(mean[0] - exact[k]) <= 1e-12 * sizes[k]
         if 2 * k <= degree:
-            assert abs(covariance[0, 0] - (exact[2 * k] - exact[k] ** 2)) <= 1e-12 * sizes[2 * k]
+            assert (
+                abs(covariance[0, 0] - (exact[2 * k] - exact[k] ** 2)) <= 1e-11 * sizes[2 * k]
+            )  # a difference of both
 
 
 @pytest.mark.parametrize("rule", ["unscented", "quadrature"])

@@ -388,6 +388,7 @@ def start_state():
         "mouth": 0.2,
         "material": np.zeros(4),
         "target_change": TARGET,
+        "released": 0.0,
     }
 
 
