@@ -94,8 +94,8 @@ class Condition:
 
 FEW = Exploration(selections=0.0, actions=0.5, noise=0.1, episodes=20)
 MANY = Exploration(selections=0.0, actions=0.5, noise=0.1, episodes=48)
-BOTH_SKILLS = Exploration(selections=0.5, actions=0.5, noise=0.1, episodes=48)
-BOTH_SKILLS_VARIED = Exploration(selections=0.5, actions=0.5, noise=0.1, episodes=60)
+BOTH_SKILLS = Exploration(selections=1.0, actions=1.0, noise=0.1, episodes=48)
+BOTH_SKILLS_VARIED = Exploration(selections=1.0, actions=1.0, noise=0.1, episodes=60)
 
 PT0_SETUP1 = Condition("setup1", "PT0-Rnone", 50, FEW)
 PT1_SETUP2 = Condition("setup2", "PT1-Rnone", 50, FEW, after=PT0_SETUP1)
