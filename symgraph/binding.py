@@ -136,7 +136,7 @@ class BoundModel:
         x = {label: kind.sym(_identifier(label), self._sizes[label]) for label in self.reads}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)  # numpy's functions work on CasADi's columns
-            returned = self._function(**{name: kind(x[label]) for name, label in self._reads.items()})  # type: ignore[operator]
+            returned = self._function(**{name: kind(x[label]) for name, label in self._reads.items()})  # type: ignore[operator]  # no propagator
         if not isinstance(returned, Mapping):
             returned = {REWARD: returned}
         return x, {label: _column(returned[name], kind) for name, (label, _) in self._writes.items()}

@@ -153,7 +153,7 @@ class EpisodeStore:
         number = checked_whole(number, "number of the episode")
         place = f"episode {number}"
         setup, seed = checked_name(setup, f"{place}: setup"), checked_whole(seed, f"{place}: seed")
-        visit = checked_visit(Visit(number, 0, None, node, observed, {}, {}, reward))  # type: ignore[arg-type]
+        visit = checked_visit(Visit(number, 0, None, node, observed, {}, {}, reward))  # type: ignore[arg-type]  # what is checked here
         with self._database.writing() as connection:
             if self._status(connection, number) is not None:
                 last = connection.execute("SELECT max(number) FROM episodes").fetchone()[0]
