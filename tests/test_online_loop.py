@@ -77,7 +77,7 @@ def test_reports_say_what_happened(learned):
     assert last.value == one.store.plans(27)[0]["value"]
     stored = one.store.episodes()[-1]
     assert (stored.total, stored.seed, stored.seconds) == (last.total, last.seed, last.seconds)
-    assert stored.info == {"attempts": 1, "selections": last.selections, "value": last.value, "explored": ""}
+    assert stored.info == {"returns": [last.total], "selections": last.selections, "value": last.value, "explored": ""}
 
 
 def test_fits_compile_and_build_nothing(learned):

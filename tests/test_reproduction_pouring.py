@@ -91,7 +91,7 @@ def test_runs_are_killed_gone_on_with_built_upon_evaluated_and_drawn(tmp_path):
 
 
 def test_an_attempt_without_a_loop_is_paid_as_in_a_loop(tmp_path):
-    from baselines import attempt
+    from baselines import episode
     from setups import SETUPS, Run, chosen
 
     from sims.pouring import PouringWorld
@@ -105,8 +105,8 @@ def test_an_attempt_without_a_loop_is_paid_as_in_a_loop(tmp_path):
             break
     (row,) = job.rows()
     world = PouringWorld(**SETUPS["setup1"])
-    again = attempt(world, report.seed, report.selections["skill"], report.actions)
-    shared = ("status", "material", "mouth", "target", "skill", "poured", "spilled", "released", "return")
+    again = episode(world, report.seed, report.selections["skill"], report.actions)
+    shared = ("status", "material", "mouth", "target", "skill", "poured", "spilled", "released", "attempts", "return")
     assert {name: again[name] for name in shared} == {name: row[name] for name in shared}
     bonus = 10.0 * (report.selections["skill"] == "tip")
     assert float(row["return"]) == pytest.approx(report.total - bonus, rel=1e-4)  # written with 5 digits

@@ -185,3 +185,19 @@ class Execution:
         self.visits.extend(new)
         if new:
             reached(new, not stored)
+
+
+def returns_of(visits: Sequence[Visit], again: str | None) -> tuple[float, ...]:
+    """Return the return of each attempt of an episode: one begins wherever the world has led on from the node `again`."""
+    node = {visit.step: visit.node for visit in visits}
+    attempt: dict[int, int] = {}
+    begun: dict[int | None, int] = {}  # {step from which the world led back, None at the start: attempt}
+    returns: list[float] = []
+    for visit in visits:
+        if visit.parent is not None and node[visit.parent] != again:
+            attempt[visit.step] = attempt[visit.parent]
+        else:
+            attempt[visit.step] = begun.setdefault(visit.parent, len(begun))
+            returns.extend([0.0] * (len(begun) - len(returns)))
+        returns[attempt[visit.step]] += visit.reward
+    return tuple(returns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -14,7 +15,7 @@ from symgraph.errors import InputError, StorageError, did_you_mean, names
 from symgraph.graph import Graph
 from symgraph.learned.deciding import Decider, Notes, Planning
 from symgraph.learned.episodes import EpisodeStore
-from symgraph.learned.execution import Diverged, Execution, WorldFailed
+from symgraph.learned.execution import Diverged, Execution, WorldFailed, returns_of
 from symgraph.learned.inputs import checked_count
 from symgraph.learned.knowledge import Knowledge, Known
 from symgraph.learned.records import Visit, checked_whole, shown
@@ -41,8 +42,7 @@ class EpisodeReport:
         seed: that the world was reset with.
         status: "done", "failed" or "interrupted".
         reason: why it failed, else empty.
-        total: the return, the sum of its rewards.
-        attempts: how often the graph was gone through, at least to its first node.
+        returns: of each attempt, from one going through the graph to the next, the sum of its rewards.
         actions: {label: value} decided last.
         selections: {label: choice} decided last.
         expected: {label: mean} of what the last plan promised.
@@ -58,8 +58,7 @@ class EpisodeReport:
     seed: int
     status: str
     reason: str
-    total: float
-    attempts: int
+    returns: tuple[float, ...]
     actions: dict[str, Any]
     selections: dict[str, str]
     expected: dict[str, Any]
@@ -67,6 +66,16 @@ class EpisodeReport:
     explored: str
     known: Known
     seconds: dict[str, float]
+
+    @property
+    def attempts(self) -> int:
+        """How often the graph was gone through, at least to its first node."""
+        return len(self.returns)
+
+    @property
+    def total(self) -> float:
+        """The return of the whole episode."""
+        return math.fsum(self.returns)
 
     def __str__(self) -> str:
         chosen = ", ".join(f"{label} = {choice}" for label, choice in self.selections.items())
@@ -221,9 +230,8 @@ class OnlineLoop:
             )
         except WorldFailed as failure:
             status, reason = "failed", str(failure)
-        return _report(
-            0, "performed", seed, status, reason, execution.visits, knowledge, decider, execution.seconds, 0.0
-        )
+        returns = returns_of(execution.visits, self._planning.again)
+        return _report(0, "performed", seed, status, reason, returns, knowledge, decider, execution.seconds, 0.0)
 
     def close(self) -> None:
         """Close the store."""
@@ -284,10 +292,11 @@ class OnlineLoop:
             self._lessons.fit(self._lessons.take(past, past, knowledge))
         except WorldFailed as failure:
             status, reason, observed = "failed", str(failure), failure.observed
+        returns = returns_of(visits, self._planning.again)
         report = _report(
-            number, stage.name, seed, status, reason, visits, knowledge, decider, execution.seconds, fitting
+            number, stage.name, seed, status, reason, returns, knowledge, decider, execution.seconds, fitting
         )
-        info = {name: getattr(report, name) for name in ("attempts", "selections", "value", "explored")}
+        info = {name: getattr(report, name) for name in ("returns", "selections", "value", "explored")}
         if status == "failed":
             info["observed"] = observed
         self.store.end(number, status, total=report.total, reason=reason, seconds=report.seconds, info=info)
@@ -376,7 +385,7 @@ def _report(
     seed: int,
     status: str,
     reason: str,
-    visits: Sequence[Visit],
+    returns: tuple[float, ...],
     knowledge: Knowledge,
     decider: Decider,
     simulating: float,
@@ -389,8 +398,7 @@ def _report(
         seed=seed,
         status=status,
         reason=reason,
-        total=float(sum(visit.reward for visit in visits)),
-        attempts=decider.attempts,
+        returns=returns,
         actions=actions,
         selections=selections,
         expected=decider.notes.get("expected", {}),

@@ -1,8 +1,9 @@
 """Pour without learning: random actions, fixed ones, a rule that chooses between these, and the best of many tries.
 
-From the repository's root, `python docs/reproduction/pouring/baselines.py --runs 2`. Every policy makes one attempt in
-each situation. Every attempt becomes a row of baselines.csv beside this program; those that are there are not made
-again. The situations are those of the runs without pre-training, by their numbers, and the fresh ones of `evaluate.py`.
+From the repository's root, `python docs/reproduction/pouring/baselines.py --runs 4`. Every policy has as many attempts
+in an episode as the loop, and does the same in each. Every episode becomes a row of baselines.csv beside this program;
+those that are there are not made again. The situations are those of the last episodes of runs without pre-training, in
+the general setup, and the fresh ones of `evaluate.py`.
 """
 
 from __future__ import annotations
@@ -17,14 +18,15 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from processes import display, work
-from setups import FOLDER, FRESH, OUTCOME, SETUPS, append, outcome, read, rounded, seed_of, write
+from setups import CONDITIONS, FOLDER, FRESH, LAST, OUTCOME, SETUPS, append, outcome, read, rounded, seed_of, write
 
 import symgraph as sg
 from models import pouring
 from sims.pouring import ACTIONS, SKILLS, PouringWorld
 from sims.pouring.world import RECEIVER_RANGE
-from symgraph.learned.execution import Execution, WorldFailed
+from symgraph.learned.execution import Execution, WorldFailed, returns_of
 from symgraph.learned.knowledge import Knowledge
+from symgraph.learned.records import Visit
 from symgraph.outcomes import ModelNumbers
 
 BASELINES = FOLDER / "baselines.csv"
@@ -46,12 +48,13 @@ GRASP = 0.3  # share of the source's height; it changes little
 # Further back everything falls short of the receiver, further forward or higher it flies over it.
 USEFUL_POSITIONS = (-0.26, 0.32), (-0.10, 0.42)
 FRICTION = 0.225  # halfway between wat or bnc, which are to be tipped, and vsc or vsc+
+EPISODES = next(one.episodes for one in CONDITIONS if one.setup == "general")
 TRIES, BALLOT = 1, 2  # joined with other numbers, what is drawn for them
 
 
 @dataclass(frozen=True)
 class Job:
-    """One attempt: which policy in which situation.
+    """One episode: which policy in which situation.
 
     Attributes:
         setup: of the situation.
@@ -114,30 +117,39 @@ def task() -> tuple[sg.Graph, ModelNumbers]:
     return pouring.graph(*networks), ModelNumbers()
 
 
-def attempt(world: PouringWorld, seed: int, skill: str, actions: Actions) -> dict[str, Any]:
-    """Pour once, with the rewards that an on-line loop would get; return the columns from "status" on."""
+def episode(
+    world: PouringWorld, seed: int, skill: str, actions: Actions, attempts: int = pouring.TRIALS["attempts"]
+) -> dict[str, Any]:
+    """Pour, with the rewards that an on-line loop would get; return the columns from "status" on."""
     graph, models = task()
     knowledge = Knowledge(graph, models, pouring.TRIALS["decisions"])
     execution = Execution(graph, world, knowledge, 0)
     decision = {"grasp_ratio": GRASP, **actions}, {"skill": skill}
     status, observed = "done", {}
+    left = attempts
+
+    def goes_on(visit: Visit) -> bool:
+        nonlocal left
+        left -= visit.node == pouring.TRIALS["again"]
+        return left > 0 and visit.node != "receiver_moved"
+
     try:
         execution.run(
             seed,
             {},
             decide=lambda visit: decision,
             reached=lambda visits, new: None,
-            goes_on=lambda visit: any(group.kind != "reward" for group in graph.groups.get(visit.node, ())),
+            goes_on=goes_on,
         )
     except WorldFailed as failure:
         status, observed = "failed", failure.observed or {}
     known = knowledge.at[execution.visits[-1].step] | observed
-    total = math.fsum(visit.reward for visit in execution.visits) if status == "done" else math.nan
-    return {"status": status, **outcome(known, skill, total), "simulating": rounded(execution.seconds)}
+    returns = returns_of(execution.visits, pouring.TRIALS["again"]) if status == "done" else None
+    return {"status": status, **outcome(known, skill, returns), "simulating": rounded(execution.seconds)}
 
 
 def best_of_tries(job: Job, world: PouringWorld) -> dict[str, Any]:
-    """Try actions of both skills in a situation, then do the best ones in the same situation with new noise.
+    """Try actions of both skills once in a situation, then do the best ones in the same situation with new noise.
 
     What is noise in the world is how the spheres have settled in the source. A world in which nothing is left to draw
     has the situation under every seed, and the seed decides the settling alone.
@@ -148,10 +160,10 @@ def best_of_tries(job: Job, world: PouringWorld) -> dict[str, Any]:
     for number in range(job.tries):
         skill = SKILLS[number % 2]
         actions = GOOD[skill] if number < len(SKILLS) else _useful(rng)
-        total = attempt(world, job.seed, skill, actions)["return"]
+        total = episode(world, job.seed, skill, actions, attempts=1)["return"]
         tried.append((float(total or -math.inf), skill, actions))
     total, skill, actions = max(tried, key=lambda one: one[0])
-    return {**attempt(same_situation(world), job.seed + 1, skill, actions), "tried": rounded(total)}
+    return {**episode(same_situation(world), job.seed + 1, skill, actions), "tried": rounded(total)}
 
 
 def _useful(rng: np.random.Generator) -> Actions:
@@ -179,29 +191,27 @@ def pour(job: Job, results: Path) -> None:
     if job.policy == BEST:
         row = best_of_tries(job, world)
     else:
-        row = attempt(world, job.seed, *POLICIES[job.policy](job, world))
+        row = episode(world, job.seed, *POLICIES[job.policy](job, world))
     about = dict(zip(COLUMNS[:4], job.key, strict=True))
     append(results, COLUMNS, [{**about, **row}])
 
 
 def main(
-    runs: Annotated[int, typer.Option(min=0, help="In whose situations is poured.")] = 2,
-    situations: Annotated[int, typer.Option(min=0, help="Of each run.")] = 80,
-    fresh: Annotated[int, typer.Option(min=0, help="Situations that no run meets.")] = 40,
-    best: Annotated[
-        int, typer.Option(min=0, help="In how many of each, the first ones, to find the best of tries.")
-    ] = 40,
-    tries: Annotated[int, typer.Option(min=2)] = 30,
+    runs: Annotated[int, typer.Option(min=0, help="In whose last situations is poured.")] = 8,
+    fresh: Annotated[int, typer.Option(min=0, help="Situations that no run meets, of each setup.")] = 100,
+    tries: Annotated[int, typer.Option(min=2, help="Of which the best is taken, in the setup varied.")] = 30,
     processes: Annotated[int, typer.Option(min=1)] = 2,
-    results: Annotated[Path, typer.Option(help="File of the attempts.")] = BASELINES,
+    results: Annotated[Path, typer.Option(help="File of the episodes.")] = BASELINES,
 ) -> None:
     """Pour, where it has not been done already."""
     rows = read(results)
     write(results, COLUMNS, rows)
     done = {tuple(row[name] for name in COLUMNS[:4]) for row in rows}
-    where = [(FRESH_RUN, k) for k in range(fresh)] + [(str(run), k) for run in range(runs) for k in range(situations)]
-    jobs = [Job(setup, name, *at, tries) for at in where for setup in ("general", "varied") for name in POLICIES]
-    jobs += [Job("varied", BEST, *at, tries) for at in where if at[1] < best]
+    where = [(setup, FRESH_RUN, k) for k in range(fresh) for setup in ("general", "varied")]
+    last = range(EPISODES - LAST, EPISODES)
+    where += [("general", str(run), k) for run in range(runs) for k in last]
+    jobs = [Job(setup, name, run, k, tries) for setup, run, k in where for name in POLICIES]
+    jobs += [Job("varied", BEST, FRESH_RUN, k, tries) for k in range(fresh)]
     jobs = [job for job in jobs if job.key not in done]
     with display() as progress:
         bar = progress.add_task("pouring", total=len(jobs))

@@ -1,13 +1,12 @@
 """Let finished runs pour in situations that none of them has met, without exploring or learning.
 
-From the repository's root, after `learn.py run`: `python docs/reproduction/pouring/evaluate.py --runs 2`. Every attempt
+From the repository's root, after `learn.py run`: `python docs/reproduction/pouring/evaluate.py --runs 2`. Every episode
 becomes a row of evaluation.csv beside this program; those that are there are not made again.
 """
 
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,12 +25,12 @@ Job = tuple[Run, tuple[int, ...]]  # which situations are to come
 
 def main(
     runs: Annotated[int, typer.Option(min=1, help="Of each condition.")] = 2,
-    situations: Annotated[int, typer.Option(min=1, help="The same ones for all runs in a setup.")] = 40,
+    situations: Annotated[int, typer.Option(min=1, help="The same ones for all runs in a setup.")] = 100,
     processes: Annotated[int, typer.Option(min=1)] = 2,
     only: Annotated[list[str] | None, typer.Option(help='Conditions such as "general*".')] = None,
     episodes: Annotated[int | None, typer.Option(min=1, help="That learn.py was given, if it was.")] = None,
     folder: Annotated[Path, typer.Option(help="Of the runs.")] = RUNS,
-    results: Annotated[Path, typer.Option(help="File of the attempts.")] = EVALUATION,
+    results: Annotated[Path, typer.Option(help="File of the episodes.")] = EVALUATION,
 ) -> None:
     """Pour, where it has not been done already."""
     rows = read(results)
@@ -69,14 +68,14 @@ def rows_of(run: Run, situations: Sequence[int]) -> Iterator[dict[str, Any]]:
     with run.loop() as loop:
         for number in situations:
             report = loop.perform(world, FRESH + number, {"bonus": no_bonus})
-            total = report.total if report.status == "done" else math.nan
+            returns = report.returns if report.status == "done" else None
             yield {
                 "setup": run.condition.setup,
                 "condition": run.condition.name,
                 "run": run.number,
                 "situation": number,
                 "status": report.status,
-                **outcome(report.known, report.selections["skill"], total),
+                **outcome(report.known, report.selections["skill"], returns),
                 "expected": rounded(report.value),
                 "simulating": rounded(report.seconds["simulating"]),
                 "planning": rounded(report.seconds["planning"]),

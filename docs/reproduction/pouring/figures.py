@@ -19,14 +19,13 @@ mpl.rcParams["svg.hashsalt"] = "pouring"  # the same drawing gives the same file
 import matplotlib.pyplot as plt
 import numpy as np
 import typer
-from setups import CONDITIONS, FOLDER, SETUPS, TARGET, features_of, read, write
+from setups import CONDITIONS, FOLDER, LAST, SETUPS, TARGET, features_of, read, write
 
 from sims.pouring import MATERIALS
 from sims.pouring.behaviour import SPHERE_AMOUNT, SPILL_AMOUNT
 
 Row = dict[str, str]
 WINDOW = 5  # episodes of the moving average, as in the paper
-LAST = 20  # episodes of a run that count as "after convergence"
 GOOD_RETURN, GOOD_SHARE, GOOD_WINDOW = -1.0, 0.8, 10  # from the first such window on, a run has converged
 MARKERS = {"tip": "o", "shake": "^"}
 

@@ -28,11 +28,13 @@ from models import pouring
 from sims.pouring import MATERIALS, PouringWorld
 from symgraph.learned import EpisodeStore, Exploration, OnlineLoop, Stage
 from symgraph.learned.episodes import Episode
+from symgraph.learned.execution import returns_of
 
 RUNS = ROOT / "output/reproduction/pouring"  # a folder per run, not committed
 RESULTS = FOLDER / "results.csv"
 TARGET = 0.3
 BONUS, BONUS_EPISODES = 10.0, 10  # the paper's reward shaping: for the favoured skill, in the first episodes of a stage
+LAST = 20  # episodes of a run that count as "after learning"
 FRESH = 10**6  # seeds of situations that no run meets: those of runs are spread over 32 bits
 
 SETUPS = {  # arguments of PouringWorld
@@ -192,15 +194,16 @@ class Run:
         known = store.known(visits[-1]) | episode.info.get("observed", {})
         skill = episode.info["selections"].get("skill", "")
         bonus = float(self.condition.bonus(number) @ [name == skill for name in pouring.SKILLS])
-        # The bonus is all that is paid at "ready"; a return without it needs no difference.
-        total = math.fsum(visit.reward for visit in visits if visit.node != "ready")
+        # The bonus is all that is paid at "ready"; returns without it need no difference.
+        paid = [replace(visit, reward=0.0) if visit.node == "ready" else visit for visit in visits]
+        returns = returns_of(paid, pouring.TRIALS["again"]) if episode.status == "done" else None
         return {
             "setup": self.condition.setup,
             "condition": self.condition.name,
             "run": self.number,
             "episode": number,
             "status": episode.status,
-            **outcome(known, skill, total if episode.status == "done" else math.nan),
+            **outcome(known, skill, returns),
             "explored": episode.info["explored"].removeprefix("drawn: ").split(":")[0],
             "expected": rounded(episode.info["value"] - bonus),
             **{name: rounded(seconds) for name, seconds in episode.seconds.items()},
@@ -217,6 +220,8 @@ OUTCOME = (
     "poured",
     "spilled",
     "released",
+    "attempts",
+    "first_return",
     "return",
 )
 COLUMNS = (
@@ -226,13 +231,13 @@ COLUMNS = (
 )
 
 
-def outcome(known: Mapping[str, Any], skill: str, total: float) -> dict[str, Any]:
-    """Return the columns `OUTCOME`: situation, skill, amounts and return of an attempt.
+def outcome(known: Mapping[str, Any], skill: str, returns: Sequence[float] | None) -> dict[str, Any]:
+    """Return the columns `OUTCOME`: situation, skill, amounts and returns of an episode.
 
     Args:
         known: all that was observed.
-        skill: that was used.
-        total: the return, NaN if it broke off.
+        skill: that was used last.
+        returns: of each attempt, None if the episode broke off.
     """
     length, _, height = known["receiver_size"]
     values = {
@@ -244,9 +249,10 @@ def outcome(known: Mapping[str, Any], skill: str, total: float) -> dict[str, Any
         "poured": known["target"] - known["target_change"] + known.get("poured_change", math.nan),
         "spilled": known["spilled"] + known.get("spilled_change", math.nan),
         "released": known["released"] + known.get("released_change", math.nan),
-        "return": total,
+        "first_return": returns[0] if returns else math.nan,
+        "return": math.fsum(returns) if returns else math.nan,
     }
-    named = {"material": name_of(known["material"]), "skill": skill}
+    named = {"material": name_of(known["material"]), "skill": skill, "attempts": len(returns) if returns else ""}
     return {**{name: rounded(value) for name, value in values.items()}, **named}
 
 
