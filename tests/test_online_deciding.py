@@ -116,11 +116,8 @@ def test_the_graph_is_gone_through_up_to_the_number_of_attempts(tmp_path):
                 assert ways[-1] == "low" or len(ways) == attempts
                 assert {visit.selections["hand"] for visit in visits[1:4]} == {visits[1].selections["hand"]}
                 assert one.store.episodes()[report.number].info["returns"] == list(report.returns)
-                first = [
-                    visit.reward
-                    for visit in visits
-                    if visit.step < [v.step for v in visits if v.node in ("thrown", "rolled")][0] + 1
-                ]
+                end = next(visit.step for visit in visits if visit.node in ("thrown", "rolled"))
+                first = [visit.reward for visit in visits if visit.step <= end]
                 assert report.returns[0] == pytest.approx(sum(first))
                 assert report.total == pytest.approx(sum(visit.reward for visit in visits))
         assert max(report.attempts for report in reports) == attempts

@@ -188,7 +188,7 @@ class Execution:
 
 
 def returns_of(visits: Sequence[Visit], again: str | None) -> tuple[float, ...]:
-    """Return the return of each attempt of an episode: one begins wherever the world has led on from the node `again`."""
+    """Return each attempt's return; an attempt begins wherever the world has led on from the node `again`."""
     node = {visit.step: visit.node for visit in visits}
     attempt: dict[int, int] = {}
     begun: dict[int | None, int] = {}  # {step from which the world led back, None at the start: attempt}
