@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from small_tasks import assert_close
 
 from symgraph.learned import losses, training
+from symgraph.learned.initialisation import initial_copies
 from symgraph.learned.perceptron import Perceptron, Scaling, rescaled
 from symgraph.learned.training import (
     FOLDS,
@@ -17,7 +18,6 @@ from symgraph.learned.training import (
     Folds,
     active_folds,
     default_steps,
-    initial_copies,
     train,
 )
 from symgraph.progress import Progress
@@ -116,31 +116,6 @@ def outputs(copies, x):
         if i < len(copies.weights) - 1:
             hidden = np.maximum(hidden, 0)
     return hidden
-
-
-def test_copies_begin_equal_and_with_zero():
-    rng = np.random.default_rng(0)
-    x = rng.normal(size=(30, 3))
-    copies = initial_copies((3, 20, 10, 2), x, 4, rng)
-    assert copies.count == 4
-    for array in copies.weights + copies.biases:
-        np.testing.assert_array_equal(array, np.repeat(array[:1], 4, axis=0))
-        assert array.dtype == np.float32
-    np.testing.assert_array_equal(outputs(copies, rng.normal(size=(9, 3))), np.zeros((4, 9, 2)))
-    shapes = [(w.shape, b.shape) for w, b in zip(copies.weights, copies.biases, strict=True)]
-    sizes = itertools.pairwise((3, 20, 10, 2))
-    assert shapes == [((4, n, m), (4, 1, m)) for n, m in sizes]
-
-
-def test_kinks_pass_through_samples():
-    """Each first unit is zero at one sample, to the rounding of single precision."""
-    rng = np.random.default_rng(1)
-    x = rng.normal(size=(30, 3))
-    copies = initial_copies((3, 50, 1), x, 1, rng)
-    before = x @ copies.weights[0][0] + copies.biases[0][0]
-    nearest = np.abs(before).argmin(axis=0)
-    assert np.abs(before).min(axis=0).max() < 1e-6
-    assert len(set(nearest)) > 15
 
 
 def random_copies(sizes, count, rng):

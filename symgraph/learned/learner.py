@@ -8,17 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from symgraph.learned.initialisation import begin_linear, initial_copies
 from symgraph.learned.perceptron import Scaling, rescaled
-from symgraph.learned.training import (
-    Copies,
-    Folds,
-    Loss,
-    Training,
-    active_folds,
-    default_steps,
-    initial_copies,
-    train,
-)
+from symgraph.learned.training import Copies, Folds, Loss, Training, active_folds, default_steps, train
 from symgraph.progress import Progress
 from symgraph.slots import Array
 
@@ -118,13 +110,15 @@ class Learner:
         count = 1 + schedule.active
         # What does not vary has no part in predictions; a network that saw how it deviates would rely on it.
         inputs = np.where(scaling[0].varies, scaling[0](x), 0.0)
+        targets = y if scaling[1] is None else scaling[1](y)
         if schedule.warm and memory is not None and memory.copies.count >= count:
             copies = rescaled(memory.copies.first(count), (memory.x, memory.y), scaling)
         else:
             copies = initial_copies(sizes, inputs, count, rng)
             if last_bias is not None:
                 copies.biases[-1][:] = last_bias
-        targets = y if scaling[1] is None else scaling[1](y)
+            if scaling[1] is not None:
+                begin_linear(copies, inputs, targets, schedule.folds)
         steps = default_steps(len(x), max(sizes[1:-1], default=100))
         steps = round(WARM_SHARE * steps) if schedule.warm else steps
         training = train(copies, inputs, targets, schedule.folds, loss, steps, rng, progress)

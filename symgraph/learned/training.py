@@ -7,7 +7,6 @@ their errors are what an error model must learn, since errors on the training sa
 from __future__ import annotations
 
 import hashlib
-import itertools
 import math
 import threading
 from collections import Counter
@@ -105,26 +104,6 @@ def default_steps(samples: int, widest: int) -> int:
     Jumps are learned late: with a third of these steps, the error on 2,000 samples of one is half as large again.
     """
     return round(min(6000, max(150, 1.25 * samples)) * min(5.0, max(1.0, 100 / max(1, widest))))
-
-
-def initial_copies(sizes: Sequence[int], x: Array, count: int, rng: np.random.Generator) -> Copies:
-    """Return equal copies of a random network that gives 0 everywhere.
-
-    The kinks of the first layer pass through samples, so that they lie where the data are (with biases of 0 they
-    would all meet in the middle); He's scale keeps the size of what passes; the last layer is 0, so that training
-    begins with the mean of the targets.
-    """
-    weights, biases = [], []
-    for layer, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):
-        w = rng.standard_normal((inputs, outputs)) * math.sqrt((1 if layer == 0 else 2) / inputs)
-        b = np.zeros((1, outputs))
-        if layer == len(sizes) - 2:
-            w[:] = 0.0
-        elif layer == 0:
-            b[0] = -np.sum(w.T * x[rng.integers(len(x), size=outputs)], axis=1)
-        weights.append(np.repeat(w[None].astype(np.float32), count, axis=0))
-        biases.append(np.repeat(b[None].astype(np.float32), count, axis=0))
-    return Copies(weights, biases)
 
 
 @dataclass(frozen=True)

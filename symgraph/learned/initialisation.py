@@ -1,0 +1,81 @@
+"""Initialisation: the weights from which a fit from scratch begins."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from symgraph.learned.training import Copies
+from symgraph.slots import Array
+
+RIDGES = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, math.inf)  # strengths of ridge regression that are tried
+
+
+def initial_copies(sizes: Sequence[int], x: Array, count: int, rng: np.random.Generator) -> Copies:
+    """Return equal copies of a random network that gives 0 everywhere.
+
+    The kinks of the first layer pass through samples, so that they lie where the data are (with biases of 0 they
+    would all meet in the middle); He's scale keeps the size of what passes; the last layer is 0, so that training
+    begins with the mean of the targets.
+    """
+    weights, biases = [], []
+    for layer, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):
+        w = rng.standard_normal((inputs, outputs)) * math.sqrt((1 if layer == 0 else 2) / inputs)
+        b = np.zeros((1, outputs))
+        if layer == len(sizes) - 2:
+            w[:] = 0.0
+        elif layer == 0:
+            b[0] = -np.sum(w.T * x[rng.integers(len(x), size=outputs)], axis=1)
+        weights.append(np.repeat(w[None].astype(np.float32), count, axis=0))
+        biases.append(np.repeat(b[None].astype(np.float32), count, axis=0))
+    return Copies(weights, biases)
+
+
+def begin_linear(copies: Copies, x: Array, targets: Array, folds: npt.NDArray[np.int64]) -> None:
+    """Let copies from `initial_copies` begin as what ridge regression makes of the samples that they learn from.
+
+    Few samples show little but slopes, and a network that has to find these first stops when it has learned noise. One
+    unit for each output, in every hidden layer, is above zero at all samples and hands a linear function on. How
+    much slopes are held back is what predicts best the samples that were left out. Networks with fewer units in a layer
+    than twice the outputs are left as they are: they need them to bend.
+
+    Args:
+        copies: copy 1 + k leaves out fold k.
+        x: (N, n) whitened inputs.
+        targets: (N, m), of mean 0.
+        folds: (N,) fold of each sample.
+
+    Source: Hoerl & Kennard, Ridge regression, Technometrics 1970.
+    """
+    m = targets.shape[1]
+    if min((w.shape[2] for w in copies.weights[:-1]), default=0) < 2 * m:
+        return
+    left_out = [folds == k for k in range(copies.count - 1)]
+    learned = [(x[~rows], targets[~rows]) for rows in (np.zeros(len(x), dtype=bool), *left_out)]
+    squares, products = [a.T @ a for a, _ in learned], [a.T @ b for a, b in learned]
+
+    def slopes(strength: float) -> list[Array]:
+        if math.isinf(strength):
+            return [np.zeros_like(b) for b in products]
+        damping = strength * np.eye(x.shape[1])
+        return [np.linalg.solve(a + damping, b) for a, b in zip(squares, products, strict=True)]
+
+    def held_out(strength: float) -> float:
+        pairs = zip(left_out, slopes(strength)[1:], strict=True)
+        return sum(float(((targets[rows] - x[rows] @ b) ** 2).sum()) for rows, b in pairs)
+
+    for copy, b in enumerate(slopes(min(RIDGES, key=held_out))):
+        lift = 1.0 - (x @ b).min(axis=0)
+        last = len(copies.weights) - 1
+        for layer, (weights, biases) in enumerate(zip(copies.weights, copies.biases, strict=True)):
+            if layer == 0:
+                weights[copy, :, :m], biases[copy, 0, :m] = b, lift
+            elif layer < last:
+                weights[copy, :, :m], biases[copy, 0, :m] = 0.0, 0.0
+                weights[copy, :m, :m] = np.eye(m)
+            else:
+                weights[copy, :m], biases[copy, 0] = np.eye(m), -lift
