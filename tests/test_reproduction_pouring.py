@@ -156,7 +156,8 @@ def test_conditions_are_those_of_the_paper():
         ("general", "PT1-Rnone"): ["setup1", "general"],
         ("general", "PT2-Rnone"): ["setup1", "setup2", "general"],
         ("general", "PT0-Rnone, both skills tried"): ["general"],
-        ("varied", "PT0-Rnone"): ["varied"],
+        ("general", "PT0-Rnone, both skills tried, one attempt"): ["general"],
+        ("varied", "PT0-Rnone, both skills tried"): ["varied"],
     }
     given = {one.name: [one.stages[-1].given_at(k)["bonus"].tolist() for k in (9, 10)] for one in CONDITIONS}
     assert given["PT0-Rtip"] == [[10, 0], [0, 0]]

@@ -129,7 +129,7 @@ def more_variety(rows: list[Row]) -> plt.Figure:
     """What the paper does not have: both skills tried in the general setup, and the varied one."""
     figure, panels = plt.subplots(1, 2, figsize=(11, 3.5), layout="constrained", sharey=True)
     draw_returns(panels[0], rows, "general", ["PT0-Rnone", "PT0-Rnone, both skills tried"])
-    draw_returns(panels[1], rows, "varied", ["PT0-Rnone"])
+    draw_returns(panels[1], rows, "varied", ["PT0-Rnone, both skills tried"])
     panels[0].set_title("general")
     panels[1].set_title("varied")
     return figure

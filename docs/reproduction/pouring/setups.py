@@ -62,6 +62,8 @@ class Condition:
         explore: how much is tried in them.
         after: the condition whose finished run this one goes on from.
         favoured: the skill that reward shaping favours.
+        attempts: in an episode, at most.
+        hidden: units in the layers of the networks.
     """
 
     setup: str
@@ -70,6 +72,8 @@ class Condition:
     explore: Exploration
     after: Condition | None = None
     favoured: str | None = None
+    attempts: int = pouring.TRIALS["attempts"]
+    hidden: tuple[int, ...] = pouring.NETWORK["hidden"]
 
     @property
     def key(self) -> str:
@@ -97,7 +101,7 @@ class Condition:
 FEW = Exploration(selections=0.0, actions=0.5, noise=0.1, episodes=20)
 MANY = Exploration(selections=0.0, actions=0.5, noise=0.1, episodes=48)
 BOTH_SKILLS = Exploration(selections=1.0, actions=1.0, noise=0.1, episodes=48)
-BOTH_SKILLS_VARIED = Exploration(selections=1.0, actions=1.0, noise=0.1, episodes=60)
+BOTH_SKILLS_VARIED = Exploration(selections=1.0, actions=1.0, noise=0.1, episodes=200)
 
 PT0_SETUP1 = Condition("setup1", "PT0-Rnone", 50, FEW)
 PT1_SETUP2 = Condition("setup2", "PT1-Rnone", 50, FEW, after=PT0_SETUP1)
@@ -111,7 +115,9 @@ CONDITIONS = [
     Condition("general", "PT1-Rnone", 80, MANY, after=PT0_SETUP1),
     Condition("general", "PT0-Rnone", 80, MANY),
     Condition("general", "PT0-Rnone, both skills tried", 80, BOTH_SKILLS),
-    Condition("varied", "PT0-Rnone", 100, BOTH_SKILLS_VARIED),
+    Condition("general", "PT0-Rnone, both skills tried, one attempt", 80, BOTH_SKILLS, attempts=1),
+    # What narrow layers make of 80 episodes wider ones do not; with 500, plans of wider ones are better.
+    Condition("varied", "PT0-Rnone, both skills tried", 500, BOTH_SKILLS_VARIED, hidden=(64, 64)),
 ]
 
 
@@ -153,12 +159,13 @@ class Run:
 
     def loop(self) -> OnlineLoop:
         """Return the loop in its folder; the graph has a bonus in all conditions, so that runs can build on others."""
-        networks = pouring.flow_network("tip"), pouring.flow_network("shake"), pouring.amount_network()
+        size = {"hidden": self.condition.hidden}
+        flows = [pouring.flow_network(skill, **size) for skill in pouring.SKILLS]
         return OnlineLoop(
-            pouring.graph(*networks, shaped=True),
+            pouring.graph(*flows, pouring.amount_network(**size), shaped=True),
             self.condition.stages,
             self.folder,
-            **pouring.TRIALS,
+            **pouring.TRIALS | {"attempts": self.condition.attempts},
             limits=pouring.LIMITS,
             optimizer=sg.Lbfgs(starts=8, iterations=60),
             seed=self.number,
