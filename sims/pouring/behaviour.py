@@ -45,6 +45,7 @@ class Phase(enum.Enum):
     READY = "ready"
     TIPPED = "tipped"
     SHAKEN = "shaken"
+    LANDED = "landed"
     POURED = "poured"
 
 
@@ -54,8 +55,9 @@ TRANSITIONS = {
     Phase.AT_RECEIVER: (Phase.AT_POUR,),
     Phase.AT_POUR: (Phase.READY,),
     Phase.READY: (Phase.TIPPED, Phase.SHAKEN),
-    Phase.TIPPED: (Phase.POURED,),
-    Phase.SHAKEN: (Phase.POURED,),
+    Phase.TIPPED: (Phase.LANDED,),
+    Phase.SHAKEN: (Phase.LANDED,),
+    Phase.LANDED: (Phase.POURED,),
     Phase.POURED: (Phase.AT_RECEIVER,),
 }
 
@@ -178,13 +180,17 @@ class Behaviour:
         self._pour(Shake(self.simulation.command, tilt_rate, speed, length, angle))
         self._enter(Phase.SHAKEN)
 
-    def measure(self) -> None:
-        """Let what is in the air come to rest, so that it can be counted."""
+    def land(self) -> None:
+        """Let what is in the air come to rest."""
         steps = round(CALM_TIME / CONTROL_STEP)
         for _ in range(steps):
             if self._calm():
                 break
             self._step(self.simulation.command)
+        self._enter(Phase.LANDED)
+
+    def measure(self) -> None:
+        """Count what lies where."""
         self._enter(Phase.POURED)
 
     def go_back(self) -> None:

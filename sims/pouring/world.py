@@ -44,7 +44,7 @@ class PouringWorld:
 
     An episode goes from node to node::
 
-        start -> grasped -> at_receiver -> at_pour -> ready -> tipped | shaken -> poured -> at_receiver ...
+        start -> grasped -> at_receiver -> at_pour -> ready -> tipped | shaken -> landed -> poured -> at_receiver ...
                        \-> receiver_moved
 
     `reset` returns what is observed at "start"; `execute` does what leaves a node and returns what was
@@ -258,6 +258,10 @@ class PouringWorld:
             raise ValueError(f"node {self.node!r}: selection 'skill' is {skill!r}; choose from {list(SKILLS)}")
         return {self.node: observation.flow(self.behaviour)}
 
+    def _land(self, actions: Actions, selections: Selections) -> dict[str, Observation]:
+        self.behaviour.land()
+        return {"landed": {}}
+
     def _measure(self, actions: Actions, selections: Selections) -> dict[str, Observation]:
         self.behaviour.measure()
         return {"poured": observation.changes(self.behaviour)}
@@ -276,8 +280,9 @@ _EDGES = {
     Phase.AT_RECEIVER: PouringWorld._move_to_pour,
     Phase.AT_POUR: PouringWorld._get_ready,
     Phase.READY: PouringWorld._pour,
-    Phase.TIPPED: PouringWorld._measure,
-    Phase.SHAKEN: PouringWorld._measure,
+    Phase.TIPPED: PouringWorld._land,
+    Phase.SHAKEN: PouringWorld._land,
+    Phase.LANDED: PouringWorld._measure,
     Phase.POURED: PouringWorld._try_again,
 }
 

@@ -47,6 +47,7 @@ EDGE_SIZES = {
     "at_pour": {"relative_position": 3},
     "ready": {},
     "shaken": {"released_change": 1, "flow_centre": 2, "flow_variance": 1},
+    "landed": {},
     "poured": {"poured_change": 1, "spilled_change": 1},
 }
 
