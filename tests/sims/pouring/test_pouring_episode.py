@@ -35,6 +35,7 @@ def test_an_episode_keeps_every_step():
         "at_pour",
         "ready",
         "shaken",
+        "landed",
         "poured",
     ]
     assert episode.end is End.TARGET
