@@ -67,9 +67,10 @@ def test_copies_begin_as_the_ridge_regression_that_predicts_best_what_was_left_o
     learned = [np.ones(40, dtype=bool), *(folds != k for k in range(3))]
     tried = [[slopes(x[rows], y[rows], s) for rows in learned] for s in (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)]
     tried.append([np.zeros((5, 2))] * 4)
-    left = [sum(((y - x @ b)[~rows] ** 2).sum() for b, rows in zip(one, learned, strict=True)) for one in tried]
-    for k, b in enumerate(tried[int(np.argmin(left))]):
-        np.testing.assert_allclose(output(copies, k, x), x @ b, atol=1e-5)
+    left = [sum(((y - x @ b)[~rows] ** 2).sum(axis=0) for b, rows in zip(o, learned, strict=True)) for o in tried]
+    for k in range(4):
+        for i, best in enumerate(np.argmin(left, axis=0)):
+            np.testing.assert_allclose(output(copies, k, x)[:, i], x @ tried[best][k][:, i], atol=1e-5)
 
 
 def test_a_copy_begins_with_nothing_of_the_fold_it_leaves_out(monkeypatch):

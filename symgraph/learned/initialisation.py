@@ -39,9 +39,9 @@ def begin_linear(copies: Copies, x: Array, targets: Array, folds: npt.NDArray[np
     """Let copies from `initial_copies` begin as what ridge regression makes of the samples that they learn from.
 
     Few samples show little but slopes, and a network that has to find these first stops when it has learned noise. One
-    unit for each output, in every hidden layer, is above zero at all samples and hands a linear function on. How
-    much slopes are held back is what predicts best the samples that were left out. Networks with fewer units in a layer
-    than twice the outputs are left as they are: they need them to bend.
+    unit for each output, in every hidden layer, is above zero at all samples and hands a linear function on. How much
+    the slopes of an output are held back is what predicts best the samples that were left out. Networks with fewer
+    units in a layer than twice the outputs are left as they are: they need them to bend.
 
     Args:
         copies: copy 1 + k leaves out fold k.
@@ -64,11 +64,14 @@ def begin_linear(copies: Copies, x: Array, targets: Array, folds: npt.NDArray[np
         damping = strength * np.eye(x.shape[1])
         return [np.linalg.solve(a + damping, b) for a, b in zip(squares, products, strict=True)]
 
-    def held_out(strength: float) -> float:
-        pairs = zip(left_out, slopes(strength)[1:], strict=True)
-        return sum(float(((targets[rows] - x[rows] @ b) ** 2).sum()) for rows, b in pairs)
-
-    for copy, b in enumerate(slopes(min(RIDGES, key=held_out))):
+    tried = [slopes(strength) for strength in RIDGES]
+    held_out = [
+        sum(((targets[rows] - x[rows] @ b) ** 2).sum(axis=0) for rows, b in zip(left_out, each[1:], strict=True))
+        for each in tried
+    ]
+    best = np.argmin(held_out, axis=0)  # for each output
+    for copy in range(copies.count):
+        b = np.column_stack([tried[best[i]][copy][:, i] for i in range(m)])
         lift = 1.0 - (x @ b).min(axis=0)
         last = len(copies.weights) - 1
         for layer, (weights, biases) in enumerate(zip(copies.weights, copies.biases, strict=True)):
