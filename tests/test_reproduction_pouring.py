@@ -174,6 +174,25 @@ def test_convergence_is_the_first_ten_episodes_with_eight_good_returns():
     assert converged([good] * 10) == 0
 
 
+def test_policies_are_compared_situation_by_situation():
+    from figures import average, paired
+
+    def row(mouth, total):
+        where = {
+            "setup": "varied",
+            "material": "wat",
+            "target": "0.3",
+            "receiver_length": "0.3",
+            "receiver_height": "0.2",
+        }
+        return where | {"mouth": str(mouth), "return": str(total)}
+
+    learned = [row(0.1, -1.0), row(0.1, -2.0), row(0.2, -0.5), row(0.25, -9.0)]
+    others = [row(0.2, -0.75), row(0.1, -4.5)]
+    assert sorted(paired(learned, others, "return")) == [0.25, 3.0]  # the third situation only one has met
+    assert average(learned[:3], "return") == "-1.00 ± 0.50"  # of -1.5 and -0.5
+
+
 def test_rows_that_were_half_written_are_dropped(tmp_path):
     from setups import append, read
 

@@ -27,6 +27,8 @@ from sims.pouring.behaviour import SPHERE_AMOUNT, SPILL_AMOUNT
 Row = dict[str, str]
 WINDOW = 5  # episodes of the moving average, as in the paper
 GOOD_RETURN, GOOD_SHARE, GOOD_WINDOW = -1.0, 0.8, 10  # from the first such window on, a run has converged
+SITUATION = ("setup", "mouth", "material", "target", "receiver_length", "receiver_height")  # tells one from others
+BOTH = "PT0-Rnone, both skills tried"
 MARKERS = {"tip": "o", "shake": "^"}
 
 
@@ -128,8 +130,8 @@ def figure_12(rows: list[Row]) -> plt.Figure:
 def more_variety(rows: list[Row]) -> plt.Figure:
     """What the paper does not have: both skills tried in the general setup, and the varied one."""
     figure, panels = plt.subplots(1, 2, figsize=(11, 3.5), layout="constrained", sharey=True)
-    draw_returns(panels[0], rows, "general", ["PT0-Rnone", "PT0-Rnone, both skills tried"])
-    draw_returns(panels[1], rows, "varied", ["PT0-Rnone, both skills tried"])
+    draw_returns(panels[0], rows, "general", ["PT0-Rnone", BOTH, f"{BOTH}, one attempt"])
+    draw_returns(panels[1], rows, "varied", [BOTH])
     panels[0].set_title("general")
     panels[1].set_title("varied")
     return figure
@@ -161,22 +163,42 @@ def spread(values: np.ndarray, form: str = ".0f") -> str:
     return f"{np.median(values):{form}} / {np.quantile(values, 0.9):{form}}" if len(values) else ""
 
 
+def average(rows: list[Row], name: str) -> str:
+    """Return mean ± standard error as text. What happens in one situation counts once, however many runs met it."""
+    values = [np.nanmean(column(same, name)) for same in grouped(rows, *SITUATION).values()]
+    return f"{np.mean(values):.2f} ± {np.std(values, ddof=1) / np.sqrt(len(values)):.2f}" if len(values) > 1 else ""
+
+
 def summary(rows: list[Row]) -> dict[str, str | int]:
-    """Return the columns of a table that describe attempts."""
+    """Return the columns of a table that describe episodes."""
     done = [row for row in rows if row["status"] == "done"]
-    total, poured, target = (column(done, name) for name in ("return", "poured", "target"))
+    total, first, poured, target = (column(done, name) for name in ("return", "first_return", "poured", "target"))
     over = np.array([max(0.0, float(row["poured"]) - float(row["target"])) for row in done if runs_freely(row)])
     named = [row for row in done if row["material"] in MATERIALS]
     fits = [row["skill"] in fitting_skills(row) for row in named]
     return {
-        "attempts": len(rows),
-        "return, mean": f"{total.mean():.2f}" if done else "",
+        "episodes": len(rows),
+        "return": average(done, "return"),
         "median": f"{np.median(total):.3f}" if done else "",
-        "reached [%]": f"{100 * (poured >= target - 1e-6).mean():.0f}" if done else "",
+        "above -1 [%]": share(total > GOOD_RETURN),
+        "first attempt": average(done, "first_return"),
+        "above -1 [%] ": share(first > GOOD_RETURN),
+        "reached [%]": share(poured >= target - 1e-6),
         "spilled": spread(column(done, "spilled") / SPILL_AMOUNT),
         "too much": spread(over / SPHERE_AMOUNT),
-        "skill fits [%]": f"{100 * np.mean(fits):.0f}" if named else "",
+        "skill fits [%]": share(np.array(fits)),
     }
+
+
+def share(held: np.ndarray) -> str:
+    """Return a share in percent as text."""
+    return f"{100 * held.mean():.0f}" if len(held) else ""
+
+
+def last_of_runs(rows: list[Row], setup: str, condition: str) -> list[Row]:
+    """Return the last episodes of each run of a condition."""
+    mine = [row for row in rows if (row["setup"], row["condition"]) == (setup, condition)]
+    return [row for run in grouped(mine, "run").values() for row in run[-LAST:]]
 
 
 def conditions_table(rows: list[Row]) -> list[dict[str, str | int]]:
@@ -188,32 +210,46 @@ def conditions_table(rows: list[Row]) -> list[dict[str, str | int]]:
         if not runs:
             continue
         when = [converged(run) for run in runs]
-        middle = np.median([np.inf if k is None else k for k in when])
         about = {
             "setup": condition.setup,
             "condition": condition.name,
             "runs": len(runs),
             "converged after": ", ".join("never" if k is None else str(k) for k in when),
-            "median run": f"{middle:g}" if np.isfinite(middle) else "never",
         }
-        lines.append(about | summary([row for run in runs for row in run[-LAST:]]))
+        lines.append(about | summary(last_of_runs(rows, condition.setup, condition.name)))
     return lines
 
 
-def comparison_table(evaluated: list[Row], baselines: list[Row]) -> list[dict[str, str | int]]:
-    """Return a line per way to pour in the same fresh situations, learned ones first."""
-    fresh = [row for row in baselines if row["run"] == "fresh"]
+def comparison_table(learned: list[Row], baselines: list[Row]) -> list[dict[str, str | int]]:
+    """Return a line per way to pour in the same situations, learned ones first."""
     lines = []
-    for rows, name in ((evaluated, "condition"), (fresh, "policy")):
+    for rows, name in ((learned, "condition"), (baselines, "policy")):
         for (setup, way), mine in grouped(rows, "setup", name).items():
             lines.append({"setup": setup, "way to pour": way} | summary(mine))
     return sorted(lines, key=lambda line: list(SETUPS).index(line["setup"]))
 
 
-def baselines_table(rows: list[Row]) -> list[dict[str, str | int]]:
-    """Return a line per policy in the situations that runs met."""
-    met = grouped([row for row in rows if row["run"] != "fresh"], "setup", "policy")
-    return [{"setup": setup, "policy": policy} | summary(mine) for (setup, policy), mine in met.items()]
+def differences_table(learned: list[Row], baselines: list[Row]) -> list[dict[str, str | int]]:
+    """Return a line per policy: how much better the learned plans do, from differences in the same situation."""
+    lines = []
+    for (setup, condition), mine in grouped(learned, "setup", "condition").items():
+        for (policy,), others in grouped([row for row in baselines if row["setup"] == setup], "policy").items():
+            line: dict[str, str | int] = {"setup": setup, "condition": condition, "against": policy}
+            for name, label in (("return", "return"), ("first_return", "first attempt")):
+                pairs = paired(mine, others, name)
+                error = np.std(pairs, ddof=1) / np.sqrt(len(pairs))
+                line |= {"situations": len(pairs), label: f"{np.mean(pairs):.2f} ± {error:.2f}"}
+            lines.append(line)
+    return lines
+
+
+def paired(learned: list[Row], others: list[Row], name: str) -> np.ndarray:
+    """Return the difference of a column in each situation that both met, means over the runs there."""
+    means = [
+        {where: np.nanmean(column(same, name)) for where, same in grouped(rows, *SITUATION).items()}
+        for rows in (learned, others)
+    ]
+    return np.array([means[0][where] - means[1][where] for where in means[0] if where in means[1]])
 
 
 FIGURES: dict[str, Callable[[list[Row]], plt.Figure]] = {
@@ -236,10 +272,14 @@ def main(folder: Annotated[Path, typer.Option(help="Of the files.")] = FOLDER) -
         figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
         figure.savefig(folder / f"{name}.png", dpi=110)
         plt.close(figure)
+    fresh, met = ([row for row in baselines if (row["run"] == "fresh") == new] for new in (True, False))
+    runs = {row["run"] for row in met}
+    tried = [row for row in last_of_runs(results, "general", BOTH) if row["run"] in runs]
     tables = {
         "conditions": conditions_table(results),
-        "comparison": comparison_table(evaluated, baselines),
-        "policies": baselines_table(baselines),
+        "comparison": comparison_table(evaluated, fresh),
+        "differences": differences_table(evaluated, fresh),
+        "policies": comparison_table(tried, met),
     }
     for name, lines in tables.items():
         if lines:
