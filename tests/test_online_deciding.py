@@ -101,7 +101,7 @@ def test_the_graph_is_gone_through_up_to_the_number_of_attempts(tmp_path):
             tmp_path / str(attempts),
             carry_graph(),
             world,
-            6,
+            12,
             explore,
             decisions=["taken", "lifted"],
             again="thrown",
@@ -154,8 +154,12 @@ def test_exploration_draws_as_often_as_it_says(tmp_path):
     assert is_share(sum("selections" in text for text in explored), total, 0.6)
     assert is_share(sum("actions" in text for text in explored), total, 0.3)
     assert is_share(explored.count("drawn: selections, actions"), total, 0.6 * 0.3)
-    of_drawn = [skill for skill, text in zip(skills, explored, strict=True) if "selections" in text]
-    assert is_share(of_drawn.count("near"), len(of_drawn), 0.5)
+    # What is planned is always "far", so that what is drawn is "near" until there are as many.
+    made = {"near": 0, "far": 0}
+    for skill, text in zip(skills, explored, strict=True):
+        if "selections" in text:
+            assert made[skill] == min(made.values())
+        made[skill] += 1
     assert all(text for skill, text in zip(skills, explored, strict=True) if skill == "near")
     drawn = actions[["actions" in text for text in explored]]
     edges = np.linspace(-1.0, 1.0, 5)
@@ -164,6 +168,35 @@ def test_exploration_draws_as_often_as_it_says(tmp_path):
     for skill, action, text in zip(skills, actions, explored, strict=True):
         if "actions" not in text:
             assert action == pytest.approx(best[skill], abs=1e-3)
+
+
+def test_choices_that_fail_count_as_made(tmp_path):
+    def aim(actions, selections, world):
+        if selections["skill"] == "near":
+            error = RuntimeError("stuck")
+            error.observed = {"y": 0.0}
+            raise error
+        return {"far_end": {"y": 0.5}}
+
+    explore = Exploration(selections=1.0, actions=0.0, noise=0.0, episodes=ALWAYS)
+    with loop(tmp_path, kick_graph(), Scripted({"s": 0.2}, {"aim": aim}), 20, explore) as one:
+        skills = [report.selections["skill"] for report in one]
+    assert skills.count("near") == skills.count("far") == 10
+    assert all(set(pair) == {"near", "far"} for pair in zip(skills[::2], skills[1::2], strict=True))
+
+
+def test_each_attempt_of_an_episode_counts_as_made(tmp_path):
+    explore = Exploration(selections=1.0, actions=0.0, noise=0.0, episodes=ALWAYS)
+    with loop(
+        tmp_path, carry_graph(), carrying(), 12, explore, decisions=["lifted"], again="thrown", attempts=4
+    ) as one:
+        list(one)
+        made = {"high": 0, "low": 0}
+        for number in range(12):
+            for plan in one.store.plans(number).values():
+                way = plan["selections"]["way"]
+                made[way] += 1
+    assert abs(made["high"] - made["low"]) <= 2
 
 
 def test_noise_has_the_spread_it_says_and_stays_in_bounds(tmp_path):
@@ -277,5 +310,6 @@ def test_start_points_come_from_the_better_half_of_what_was_done(tmp_path):
         reports = list(one)
         done = sorted((report for report in reports if report.status == "done"), key=lambda report: -report.total)
         assert len(done) == 8
-        starts = one._starts(12)
+        starts = one._starts(12, "toy")
+        assert one._starts(12, "another stage") == []
     assert sorted(start["u"] for start in starts) == sorted(report.actions["u"] for report in done[:4])

@@ -105,7 +105,6 @@ def test_more_episodes_in_the_last_stage_go_on_and_other_stages_are_refused(tmp_
     ("change", "changed"),
     [
         ({"seed": 1}, "seed"),
-        ({"decisions": ["near_end"]}, "decisions"),
         ({"remembered": 3}, "remembered"),
         ({"again": "near_end"}, "again"),
         ({"again": "near_end", "attempts": 2}, "attempts"),
@@ -124,6 +123,9 @@ def test_other_settings_are_refused(tmp_path, change, changed):
     refuses(
         lambda: loop(tmp_path, other, kicking(), 2), sg.InputError, "already has settings, with others for 'learned'"
     )
+    # "aim" is where the graph starts, so it is decided there anyway
+    with loop(tmp_path, kick_graph(), kicking(), 1, decisions=["aim"]):
+        pass
     more = kick_graph(w=sg.State())
     refuses(lambda: loop(tmp_path, more, kicking(), 2), sg.InputError, "already has settings, with others for 'slots'")
 
@@ -145,6 +147,10 @@ def test_two_loops_in_one_folder_are_refused(tmp_path):
     [
         ({"decisions": "aim"}, "decisions = 'aim'; give a list of nodes"),
         ({"decisions": ["aime"]}, "decisions: 'aime' is no node of the graph; did you mean 'aim'?"),
+        (
+            {"decisions": ["near_end"]},
+            "decisions: the graph ends at 'near_end', so there is nothing to decide; leave it",
+        ),
         ({"again": "near"}, "again: 'near' is no node of the graph; did you mean 'near_end'?"),
         ({"again": "aim"}, "again: branches lead on from 'aim'; give a node at which the graph ends"),
         ({"attempts": 0}, "attempts is 0; give a positive whole number"),

@@ -23,6 +23,7 @@ from symgraph.slots import Action
 from symgraph.tree import Tree
 
 Notes = dict[str, Any]  # what is stored of a plan
+DRAWS = 2  # joined with other numbers, what is drawn for exploration
 
 
 @dataclass(frozen=True)
@@ -55,13 +56,14 @@ class Decider:
         number: of the episode.
         explore: how much is tried in this episode.
         starts: decisions of other episodes, to start searches from.
-        rare: {selection: the choices made least often so far}, which are drawn from.
+        made: {selection: choice} of every plan of other episodes; what is drawn is among what was chosen least often.
         recalled: {step: notes} of plans that were made before.
         note: called with the step and the notes of every new plan.
 
     Attributes:
         decision: the latest.
         notes: of the latest plan.
+        plans: {step: notes} of all plans of the episode so far.
         attempts: begun so far: at the start, and where the world has led back to.
         seconds: that planning took [s].
     """
@@ -73,7 +75,7 @@ class Decider:
         number: int,
         explore: Exploration,
         starts: Sequence[Mapping[str, Any]] = (),
-        rare: Mapping[str, Sequence[str]] | None = None,
+        made: Sequence[Mapping[str, str]] = (),
         recalled: Mapping[int, Notes] | None = None,
         note: Callable[[int, Notes], None] = lambda step, notes: None,
     ) -> None:
@@ -82,7 +84,7 @@ class Decider:
         self._number = number
         self._explore = explore
         self._starts = list(starts)
-        self._rare = rare or {}
+        self._made = list(made)
         self._recalled = recalled or {}
         self._note = note
         self._fixed: dict[str, Any] = {}
@@ -90,6 +92,7 @@ class Decider:
         self._ends: set[int] = set()  # steps from which the world may lead back
         self.decision: Decision = {}, {}
         self.notes: Notes = {}
+        self.plans: dict[int, Notes] = {}
         self.attempts = 0
         self.seconds = 0.0
 
@@ -110,16 +113,18 @@ class Decider:
         if visit.node in self._planning.objectives:
             begin = time.perf_counter()
             if visit.step in self._recalled:
-                self._take_over(self._recalled[visit.step])
+                notes = self._recalled[visit.step]
             else:
                 notes = self._planned(visit)
                 self._note(visit.step, notes)
-                self._take_over(notes)
+            self.plans[visit.step] = notes
+            self._take_over(notes)
             self.seconds += time.perf_counter() - begin
         return self.decision
 
     def recall(self) -> None:
-        """Take over the last of the plans that were made before."""
+        """Take over the plans that were made before, and no others."""
+        self.plans = dict(self._recalled)
         if self._recalled:
             self._take_over(self._recalled[max(self._recalled)])
 
@@ -131,11 +136,11 @@ class Decider:
     def _begin_attempt(self) -> None:
         """Draw what is tried in an attempt, all of whose decisions keep to it."""
         graph = self._planning.graph
-        rng = np.random.default_rng([self._planning.seed, self._number, self.attempts])
+        rng = np.random.default_rng([self._planning.seed, self._number, self.attempts, DRAWS])
         self.attempts += 1
         draws_selections, draws_actions = rng.random(2) < (self._explore.selections, self._explore.actions)
         selections = {
-            label: str(rng.choice(self._rare.get(label, slot.choices))) for label, slot in graph.selections().items()
+            label: str(rng.choice(self._rare(label, slot.choices))) for label, slot in graph.selections().items()
         }
         actions = {label: rng.uniform(slot.lower, slot.upper) for label, slot in graph.actions().items()}
         self._fixed = {**(selections if draws_selections else {}), **(actions if draws_actions else {})}
@@ -143,6 +148,13 @@ class Decider:
             label: self._explore.noise * rng.standard_normal(slot.size) * (slot.upper - slot.lower)
             for label, slot in graph.actions().items()
         }
+
+    def _rare(self, label: str, choices: Sequence[str]) -> list[str]:
+        """Return the choices of a selection that were made least often, so that no skill stays unknown."""
+        here = (notes["selections"] for notes in self.plans.values())
+        made = [selections.get(label) for selections in (*self._made, *here)]
+        fewest = min(made.count(choice) for choice in choices)
+        return [choice for choice in choices if made.count(choice) == fewest]
 
     def _planned(self, visit: Visit) -> Notes:
         """Plan at a visit's node, and return what is decided and expected."""

@@ -74,7 +74,7 @@ class Execution:
             given: {label: value} of states that the world does not observe.
             decide: returns the actions and selections with which a visit's node is left.
             reached: called with the visits that an executed node has led to, and whether they are new.
-            goes_on: whether the world is asked to leave a visit's node.
+            goes_on: whether the world is asked to leave a visit's node; called once for each visit.
 
         Raises:
             WorldFailed: the world raised, on the way, an exception with an attribute `observed`. Any other comes out

@@ -30,6 +30,7 @@ from symgraph.planner import solve
 from symgraph.tree import unroll
 
 STORE = "episodes.sqlite"  # in the folder of a loop
+STARTS = 1  # joined with other numbers, what is drawn for start points
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,23 @@ class EpisodeReport:
         return "; ".join(part for part in parts if part)
 
 
+@dataclass(frozen=True)
+class _Past:
+    """What is remembered of an episode that is over.
+
+    Attributes:
+        setup: the name of its stage.
+        total: its return; None if it ended early, and may not have come to what it would have been punished for.
+        decision: the last one, {label: value or choice}.
+        selections: {selection: choice} of every plan.
+    """
+
+    setup: str
+    total: float | None
+    decision: dict[str, Any]
+    selections: list[dict[str, str]]
+
+
 class OnlineLoop:
     """Learn a task by doing it: plan, execute, store, re-fit the models whose edge ran, and again.
 
@@ -103,7 +121,7 @@ class OnlineLoop:
         optimizer: of the plans, `solve`'s default if left out.
         limits: {label: (low, high)}: values beyond are clipped before they are learned from; rare accidents would
             otherwise dominate a fit.
-        remembered: how many start points of a plan come from the better half of the past episodes.
+        remembered: how many start points of a plan come from the better half of the stage's past episodes.
         seed: of all that is random.
 
     Raises:
@@ -147,10 +165,10 @@ class OnlineLoop:
             seed,
         )
         self._lessons = Lessons(graph, {} if limits is None else limits, self.folder, seed)
-        self._past: list[tuple[float, dict[str, Any]]] = []  # return and last decision of each past episode
-        # How many episodes are taken over; samples of each model and length of _past then. Changed at once, so that
-        # an exception at any moment leaves what can be gone on from.
-        self._taken = 0, self._lessons.counts(), 0
+        self._past: list[_Past] = []
+        # How many episodes are taken over, and samples of each model then. Changed at once, so that an exception at any
+        # moment leaves what can be gone on from.
+        self._taken = 0, self._lessons.counts()
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -221,7 +239,7 @@ class OnlineLoop:
             given: {label: value} of states that it does not observe.
         """
         knowledge = self._knowledge()
-        decider = Decider(self._planning, knowledge, 0, Exploration(episodes=0).at(0), self._starts(0))
+        decider = Decider(self._planning, knowledge, 0, Exploration(episodes=0).at(0), self._starts(0, None))
         execution = Execution(self.graph, world, knowledge, 0)
         status, reason = "done", ""
         try:
@@ -230,6 +248,7 @@ class OnlineLoop:
             )
         except WorldFailed as failure:
             status, reason = "failed", str(failure)
+            knowledge.latest |= failure.observed
         returns = returns_of(execution.visits, self._planning.again)
         return _report(0, "performed", seed, status, reason, returns, knowledge, decider, execution.seconds, 0.0)
 
@@ -261,8 +280,8 @@ class OnlineLoop:
             knowledge,
             number,
             stage.explore.at(within),
-            self._starts(number),
-            self._rare(),
+            self._starts(number, stage.name),
+            [selections for past in self._past for selections in past.selections],
             plans,
             lambda step, notes: self.store.note_plan(number, step, notes),
         )
@@ -292,6 +311,7 @@ class OnlineLoop:
             self._lessons.fit(self._lessons.take(past, past, knowledge))
         except WorldFailed as failure:
             status, reason, observed = "failed", str(failure), failure.observed
+            knowledge.latest |= observed
         returns = returns_of(visits, self._planning.again)
         report = _report(
             number, stage.name, seed, status, reason, returns, knowledge, decider, execution.seconds, fitting
@@ -300,15 +320,13 @@ class OnlineLoop:
         if status == "failed":
             info["observed"] = observed
         self.store.end(number, status, total=report.total, reason=reason, seconds=report.seconds, info=info)
-        self._remember(status, report.total, decider.notes)
-        self._taken = number + 1, self._lessons.counts(), len(self._past)
+        self._remember(stage.name, status, report.total, decider.plans)
+        self._taken = number + 1, self._lessons.counts()
         return report
 
     def _recall(self) -> None:
         """Take over what the folder holds."""
         self._lessons.restore()
-        if not len(self.store):
-            self._lessons.check_unfitted()
         for episode in self.store.episodes():
             stage = self._stage_of(episode.number)[0] if episode.number < self.episodes else None
             if stage is None or stage.name != episode.setup:
@@ -317,21 +335,29 @@ class OnlineLoop:
                     f"{self.folder / STORE}: episode {episode.number} is of stage {episode.setup!r}, but the stages "
                     f"have {wanted}; give those it was made with, or another folder"
                 )
-        self._catch_up(self._next())  # one that is running is gone through again, and learned from, by and by
+        number = self._next()
+        self._catch_up(number)
+        # One that is running is gone through again, and learned from, by and by; its samples may have been fitted.
+        running = self.store.visits(number)
+        knowledge = self._knowledge()
+        knowledge.take_over(running)
+        self._lessons.take(running, running, knowledge)
+        self._lessons.check_seen()
+        self._lessons.rewind(self._taken[1])
         self._lessons.fit(self._lessons.all.values())
 
     def _catch_up(self, number: int) -> None:
         """Take over, from the store, the episodes before a number, and nothing else."""
-        over, counts, remembered = self._taken
+        over, counts = self._taken
         self._lessons.rewind(counts)
-        del self._past[remembered:]
+        del self._past[over:]
         for episode in self.store.episodes()[over:number] if over < number else ():
-            visits, plans = self.store.visits(episode.number), self.store.plans(episode.number)
+            visits = self.store.visits(episode.number)
             knowledge = self._knowledge()
             knowledge.take_over(visits)
             self._lessons.take(visits, visits, knowledge)
-            self._remember(episode.status, episode.total, plans[max(plans)] if plans else {})
-        self._taken = number, self._lessons.counts(), len(self._past)
+            self._remember(episode.setup, episode.status, episode.total, self.store.plans(episode.number))
+        self._taken = number, self._lessons.counts()
 
     def _stage_of(self, number: int) -> tuple[Stage, int]:
         """Return the stage of an episode and its place in it."""
@@ -344,25 +370,20 @@ class OnlineLoop:
     def _knowledge(self) -> Knowledge:
         return Knowledge(self.graph, self._models, self.decisions)
 
-    def _remember(self, status: str, total: float | None, notes: Notes) -> None:
-        # An episode that ended early may not have come to what it would have been punished for.
-        if status == "done" and notes and total is not None and np.isfinite(total):
-            self._past.append((total, {**notes["actions"], **notes["selections"]}))
+    def _remember(self, setup: str, status: str, total: float | None, plans: Mapping[int, Notes]) -> None:
+        last: Notes = plans[max(plans)] if plans else {"actions": {}, "selections": {}}
+        counts = status == "done" and bool(plans) and total is not None and math.isfinite(total)
+        decision = {**last["actions"], **last["selections"]}
+        self._past.append(_Past(setup, total if counts else None, decision, [p["selections"] for p in plans.values()]))
 
-    def _starts(self, number: int) -> list[dict[str, Any]]:
-        """Draw start points from the better half of the past episodes."""
-        better = sorted(self._past, key=lambda one: -one[0])[: (len(self._past) + 1) // 2]
-        rng = np.random.default_rng([self._planning.seed, number])
+    def _starts(self, number: int, setup: str | None) -> list[dict[str, Any]]:
+        """Draw start points from the better half of the past episodes of a stage, of all stages if None."""
+        done = [
+            (past.total, past.decision) for past in self._past if past.total is not None and setup in (None, past.setup)
+        ]
+        better = sorted(done, key=lambda one: -one[0])[: (len(done) + 1) // 2]
+        rng = np.random.default_rng([self._planning.seed, number, STARTS])
         return [better[i][1] for i in rng.permutation(len(better))[: self._remembered]]
-
-    def _rare(self) -> dict[str, list[str]]:
-        """Return the choices of each selection that were made least often, so that no skill stays unknown."""
-        rare = {}
-        for label, slot in self.graph.selections().items():
-            made = [decided.get(label) for _, decided in self._past]
-            fewest = min(made.count(choice) for choice in slot.choices)
-            rare[label] = [choice for choice in slot.choices if made.count(choice) == fewest]
-        return rare
 
 
 def _checked_nodes(graph: Graph, decisions: Any, again: Any) -> list[str]:
@@ -374,6 +395,9 @@ def _checked_nodes(graph: Graph, decisions: Any, again: Any) -> list[str]:
         if node not in graph.nodes:
             hint = did_you_mean(node, graph.nodes)
             raise InputError(f"{place}: {node!r} is no node of the graph{hint} Nodes: {names(graph.nodes)}")
+    for node in nodes:
+        if all(group.kind == "reward" for group in graph.groups.get(node, ())):
+            raise InputError(f"decisions: the graph ends at {node!r}, so there is nothing to decide; leave it out")
     if any(group.kind != "reward" for group in graph.groups.get(again, ())):
         raise InputError(f"again: branches lead on from {again!r}; give a node at which the graph ends")
     return nodes

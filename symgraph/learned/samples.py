@@ -92,14 +92,20 @@ class Lessons:
             if self.file_of(name).exists():
                 lesson.model.restore(self.file_of(name))
 
-    def check_unfitted(self) -> None:
-        """Raise InputError where a model has seen samples that no episode holds."""
+    def check_seen(self) -> None:
+        """Fit anew the models whose file has seen more samples than there are; raise InputError where others have.
+
+        A power cut may take visits that a file has learned from. A fit to those that are left goes on from there.
+        """
         for name, lesson in self.all.items():
-            if lesson.model.samples:
+            seen, count, file = lesson.model.samples, len(lesson.x), self.file_of(name)
+            if seen > count and not (count and file.exists()):
                 raise InputError(
-                    f"model {name!r} has seen {lesson.model.samples} samples, of which the episodes in {self._folder} "
-                    f"know nothing; give a new model, or the folder of those episodes"
+                    f"model {name!r} has seen {seen} samples, of which the episodes in {self._folder} know "
+                    f"{count or 'nothing'}; give a new model, and take {file.name} away if it is in that folder"
                 )
+            if seen > count:
+                self._refit(lesson)
 
     def counts(self) -> dict[str, int]:
         """Return how many samples each model has."""
@@ -113,10 +119,13 @@ class Lessons:
     def fit(self, lessons: Iterable[Lesson]) -> None:
         """Fit the models that have not seen all of their samples, and keep each in its file."""
         for lesson in lessons:
-            name, count = lesson.model.name, len(lesson.x)
-            if lesson.model.samples < count:
-                lesson.fit(zlib.crc32(repr((self._seed, name, count)).encode()))
-                lesson.model.save(self.file_of(name))
+            if lesson.model.samples < len(lesson.x):
+                self._refit(lesson)
+
+    def _refit(self, lesson: Lesson) -> None:
+        name = lesson.model.name
+        lesson.fit(zlib.crc32(repr((self._seed, name, len(lesson.x))).encode()))
+        lesson.model.save(self.file_of(name))
 
     def file_of(self, name: str) -> Path:
         """Return the file in which the model of this name is kept."""

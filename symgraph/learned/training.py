@@ -98,7 +98,7 @@ def active_folds(samples: int) -> int:
 
 
 def default_steps(samples: int, widest: int) -> int:
-    """Return the most steps of a fit from scratch: 150 up to 120 samples, 250 for 200, 2,500 for 2,000, 6,000 at most.
+    """Return the most steps of a fit from scratch: 150 up to 120 samples, 250 for 200, 2,500 for 2,000, at most 6,000.
 
     Layers of less than 100 units learn more slowly, in steps that cost less: they get up to five times as many.
     Jumps are learned late: with a third of these steps, the error on 2,000 samples of one is half as large again.

@@ -102,7 +102,7 @@ class Condition:
 FEW = Exploration(selections=0.0, actions=0.5, noise=0.1, episodes=20)
 MANY = Exploration(selections=0.0, actions=0.5, noise=0.1, episodes=48)
 BOTH_SKILLS = Exploration(selections=1.0, actions=1.0, noise=0.1, episodes=48)
-BOTH_SKILLS_VARIED = Exploration(selections=1.0, actions=1.0, noise=0.1, episodes=160)
+BOTH_SKILLS_VARIED = Exploration(selections=1.0, actions=1.0, noise=0.1, episodes=120)
 
 PT0_SETUP1 = Condition("setup1", "PT0-Rnone", 50, FEW)
 PT1_SETUP2 = Condition("setup2", "PT1-Rnone", 50, FEW, after=PT0_SETUP1)
@@ -117,8 +117,8 @@ CONDITIONS = [
     Condition("general", "PT0-Rnone", 80, MANY),
     Condition("general", "PT0-Rnone, both skills tried", 80, BOTH_SKILLS),
     Condition("general", "PT0-Rnone, both skills tried, one attempt", 80, BOTH_SKILLS, attempts=1),
-    # What narrow layers make of 80 episodes wider ones do not; with 500, plans of wider ones are better.
-    Condition("varied", "PT0-Rnone, both skills tried", 400, BOTH_SKILLS_VARIED, hidden=(64, 64)),
+    # What narrow layers make of 80 episodes wider ones do not; with 300 or more, plans of wider ones are better.
+    Condition("varied", "PT0-Rnone, both skills tried", 300, BOTH_SKILLS_VARIED, hidden=(64, 64)),
 ]
 
 
