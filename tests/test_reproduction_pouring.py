@@ -174,23 +174,44 @@ def test_convergence_is_the_first_ten_episodes_with_eight_good_returns():
     assert converged([good] * 10) == 0
 
 
+def row(seed, total, status="done", **more):
+    where = {"seed": str(seed), "status": status, "setup": "setup1", "material": "bnc", "mouth": "0.23"}
+    amounts = {"target": "0.3", "poured": "0.33", "spilled": "0.2", "first_return": str(total), "return": str(total)}
+    return where | amounts | {"run": "0", "skill": "tip", "explored": ""} | more
+
+
 def test_policies_are_compared_situation_by_situation():
-    from figures import average, paired
+    from figures import average, differences_table, paired
 
-    def row(mouth, total):
-        where = {
-            "setup": "varied",
-            "material": "wat",
-            "target": "0.3",
-            "receiver_length": "0.3",
-            "receiver_height": "0.2",
-        }
-        return where | {"mouth": str(mouth), "return": str(total)}
-
-    learned = [row(0.1, -1.0), row(0.1, -2.0), row(0.2, -0.5), row(0.25, -9.0)]
-    others = [row(0.2, -0.75), row(0.1, -4.5)]
-    assert sorted(paired(learned, others, "return")) == [0.25, 3.0]  # the third situation only one has met
+    learned = [row(1, -1.0), row(1, -2.0), row(2, -0.5), row(3, -9.0)]
+    others = [row(2, -0.75), row(1, -4.25), row(3, "", "failed")]
+    assert sorted(paired(learned, others, "return")) == [0.25, 2.75]  # the third one broke off
     assert average(learned[:3], "return") == "-1.00 ± 0.50"  # of -1.5 and -0.5
+    named = [one | {"condition": "c"} for one in learned], [one | {"policy": "p"} for one in others]
+    (line,) = differences_table(*named)
+    assert (line["situations"], line["return"]) == (2, "1.50 ± 1.25")
+
+
+def test_what_broke_off_has_reached_nothing():
+    from figures import summary
+
+    said = summary([row(1, -0.5), row(2, -3.0), row(3, -0.5, run="1"), row(4, "", "failed", poured="")])
+    assert {name: said[name] for name in ("episodes", "failed", "by run", "above -1 [%]", "reached [%]")} == {
+        "episodes": 4,
+        "failed": 1,
+        "by run": "-1.75, -0.50",
+        "above -1 [%]": "50",
+        "reached [%]": "75",
+    }
+    assert said["spilled"] == "2 / 2"
+
+
+def test_plans_alone_tell_when_a_run_has_converged():
+    from figures import converged, converged_plans
+
+    tried = [row(k, -5.0, explored="drawn" if k % 2 else "") | {"return": "-5" if k % 2 else "-0.1"} for k in range(30)]
+    assert converged(tried) is None
+    assert converged_plans(tried) == 0
 
 
 def test_rows_that_were_half_written_are_dropped(tmp_path):

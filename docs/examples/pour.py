@@ -18,6 +18,7 @@ of Yamaguchi & Atkeson, *Differential Dynamic Programming for Graph-Structured D
 # materials between the known ones.
 
 import enum
+import itertools
 from pathlib import Path
 from typing import Annotated
 
@@ -45,6 +46,7 @@ SETUPS = {
     },
 }
 PROOFS = 6  # situations at the end that it has never met
+EXPLORED = 48  # episodes in which it tries something beside its plans, less often each time
 
 # %%
 # The task and the loop
@@ -55,11 +57,11 @@ PROOFS = 6  # situations at the end that it has never met
 # was poured it tries again, up to four times in an episode.
 
 
-def loop_in(world, setup, episodes, seed, folder):
+def loop_in(world, name, episodes, seed, folder):
     graph = pouring.graph(pouring.flow_network("tip"), pouring.flow_network("shake"), pouring.amount_network())
     return sg.learned.OnlineLoop(
         graph,
-        [sg.learned.Stage(setup, world, episodes, sg.learned.Exploration(episodes=0.6 * episodes))],
+        [sg.learned.Stage(name, world, episodes, sg.learned.Exploration(episodes=EXPLORED))],
         folder,
         **pouring.TRIALS,
         limits=pouring.LIMITS,
@@ -81,6 +83,8 @@ def aligned(cells):
 
 
 def told(episode):
+    if episode.status != "done":
+        return f"{episode.status}: {episode.reason}"
     seen = episode.known
     return aligned(
         [
@@ -108,8 +112,8 @@ def learn(loop, console):
         console.print(f"episode  {aligned(HEADS)}  tried", highlight=False)
         for episode in loop:
             console.print(f"{episode.number + 1:7}  {told(episode)}  {episode.explored.split(':')[0]}", highlight=False)
-            returns.append(episode.total)
-            recent = np.median(returns[-10:])
+            returns.append(episode.total if episode.status == "done" else np.nan)
+            recent = np.nanmedian(returns[-10:])
             progress.update(task, advance=1, description=f"learning; median of the last 10 returns {recent:.2f}")
 
 
@@ -126,7 +130,7 @@ def prove(loop, world, console, folder):
     for seed in range(10**6, 10**6 + PROOFS):
         filmed = FilmedWorld(world)
         episode = loop.perform(filmed, seed)
-        expected = episode.expected["poured_change"]
+        expected = episode.expected.get("poured_change", np.nan)
         console.print(f"{told(episode)}  {expected:.3f}", highlight=False)
         films.setdefault(episode.selections["skill"], filmed.frames)
     write_video(folder / "pouring.mp4", [frame for frames in films.values() for frame in frames], fps=20)
@@ -157,12 +161,12 @@ def draw_curve(loop, folder):
 # The skill map shows what it would do in other situations: which skill, and the return that it expects.
 
 
-def draw_map(loop, setup, folder):
+def draw_map(loop, target, folder):
     mouths = np.linspace(0.11, 0.25, 8)
     figure, axes = plt.subplots(figsize=(8, 3), layout="constrained")
     for j, material in enumerate(MATERIALS):
         for mouth in mouths:
-            situation = PouringWorld(material, float(mouth), target=0.3, receiver_x=0.8).reset(0)
+            situation = PouringWorld(material, float(mouth), target, receiver_x=0.8).reset(0)
             plan = loop.plan(situation)
             marker = {"tip": "o", "shake": "^"}[plan.selections["skill"]]
             picture = axes.scatter(mouth, j, marker=marker, s=120, c=[plan.value], vmin=-2, vmax=0, cmap="viridis")
@@ -193,24 +197,24 @@ def main(
     """Learn to pour from scratch, then pour in situations never met."""
     console = Console()
     given = {"material": material and str(material), "mouth": mouth, "target": target}
-    world = PouringWorld(**SETUPS[condition] | {name: value for name, value in given.items() if value is not None})
+    given = {name: value for name, value in given.items() if value is not None}
+    world = PouringWorld(**SETUPS[condition] | given)
     if not resume:
         output = unused(output)
-    with loop_in(world, str(condition), episodes, seed, output) as loop:
+    console.print(f"All is kept in {output}; --resume --output {output} goes on with it", highlight=False)
+    name = " ".join([str(condition), *(f"{name}={value}" for name, value in given.items())])
+    with loop_in(world, name, episodes, seed, output) as loop:
         learn(loop, console)
         prove(loop, world, console, output)
         draw_curve(loop, output)
-        draw_map(loop, condition, output)
+        draw_map(loop, 0.3 if target is None else target, output)
     console.print(f"\nLearning curve, skill map, film, episodes and networks are in {output}", highlight=False)
 
 
 def unused(folder):
     """The folder, or one beside it that holds no run yet."""
-    for number in range(2, 1000):
-        if not (folder / "episodes.sqlite").exists():
-            break
-        folder = folder.with_name(f"{folder.name.split('-')[0]}-{number}")
-    return folder
+    beside = (folder.with_name(f"{folder.name}-{number}") for number in itertools.count(2))
+    return next(one for one in itertools.chain([folder], beside) if not (one / "episodes.sqlite").exists())
 
 
 if __name__ == "__main__":

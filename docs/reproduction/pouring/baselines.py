@@ -3,7 +3,8 @@
 From the repository's root, `python docs/reproduction/pouring/baselines.py --runs 4`. Every policy has as many attempts
 in an episode as the loop, and does the same in each. Every episode becomes a row of baselines.csv beside this program;
 those that are there are not made again. The situations are those of the last episodes of runs without pre-training, in
-the general setup, and the fresh ones of `evaluate.py`.
+the general setup, and the fresh ones of `evaluate.py`. Nothing is learned here; should the world change, remove the
+file.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from symgraph.learned.records import Visit
 from symgraph.outcomes import ModelNumbers
 
 BASELINES = FOLDER / "baselines.csv"
-COLUMNS = ("setup", "policy", "run", "situation", "status", *OUTCOME, "tried", "simulating")
+COLUMNS = ("setup", "policy", "run", "situation", "seed", "status", *OUTCOME, "tried", "simulating")
 FRESH_RUN = "fresh"  # stands in place of a run's number
 
 Actions = Mapping[str, Any]
@@ -193,7 +194,7 @@ def pour(job: Job, results: Path) -> None:
     else:
         row = episode(world, job.seed, *POLICIES[job.policy](job, world))
     about = dict(zip(COLUMNS[:4], job.key, strict=True))
-    append(results, COLUMNS, [{**about, **row}])
+    append(results, COLUMNS, [{**about, "seed": job.seed, **row}])
 
 
 def main(

@@ -1,7 +1,7 @@
 """Let finished runs pour in situations that none of them has met, without exploring or learning.
 
 From the repository's root, after `learn.py run`: `python docs/reproduction/pouring/evaluate.py --runs 2`. Every episode
-becomes a row of evaluation.csv beside this program; those that are there are not made again.
+becomes a row of evaluation.csv beside this program; those that are there are not made again, unless the run was.
 """
 
 from __future__ import annotations
@@ -19,7 +19,19 @@ from setups import FOLDER, FRESH, OUTCOME, RUNS, SETUPS, Run, append, chosen, ou
 from sims.pouring import PouringWorld
 
 EVALUATION = FOLDER / "evaluation.csv"
-COLUMNS = ("setup", "condition", "run", "situation", "status", *OUTCOME, "expected", "simulating", "planning")
+COLUMNS = (
+    "setup",
+    "condition",
+    "run",
+    "learned",
+    "situation",
+    "seed",
+    "status",
+    *OUTCOME,
+    "expected",
+    "simulating",
+    "planning",
+)
 Job = tuple[Run, tuple[int, ...]]  # which situations are to come
 
 
@@ -34,17 +46,20 @@ def main(
 ) -> None:
     """Pour, where it has not been done already."""
     rows = read(results)
-    write(results, COLUMNS, rows)
-    done = {tuple(row[name] for name in COLUMNS[:4]) for row in rows}
-    jobs = []
+    jobs: list[Job] = []
     for condition in chosen(only or ["*"], episodes, bases=False):
         for run in (Run(condition, number, folder) for number in range(runs)):
-            key = condition.setup, condition.name, str(run.number)
-            missing = tuple(k for k in range(situations) if (*key, str(k)) not in done)
-            if run.finished and missing:
-                jobs.append((run, missing))
-            elif missing:
+            key = {"setup": condition.setup, "condition": condition.name, "run": str(run.number)}
+            mine = [row for row in rows if key.items() <= row.items()]
+            if not run.finished:
                 typer.echo(f"{condition.key}, run {run.number}: not finished, left out")
+                continue
+            rows = [row for row in rows if row not in mine or row["learned"] == run.ended]
+            done = {row["situation"] for row in mine if row["learned"] == run.ended}
+            missing = tuple(k for k in range(situations) if str(k) not in done)
+            if missing:
+                jobs.append((run, missing))
+    write(results, COLUMNS, rows)
     with display() as progress:
         bar = progress.add_task("evaluating", total=sum(len(missing) for _, missing in jobs))
         work(
@@ -73,7 +88,9 @@ def rows_of(run: Run, situations: Sequence[int]) -> Iterator[dict[str, Any]]:
                 "setup": run.condition.setup,
                 "condition": run.condition.name,
                 "run": run.number,
+                "learned": run.ended,
                 "situation": number,
+                "seed": FRESH + number,
                 "status": report.status,
                 **outcome(report.known, report.selections["skill"], returns),
                 "expected": rounded(report.value),

@@ -27,7 +27,6 @@ from sims.pouring.behaviour import SPHERE_AMOUNT, SPILL_AMOUNT
 Row = dict[str, str]
 WINDOW = 5  # episodes of the moving average, as in the paper
 GOOD_RETURN, GOOD_SHARE, GOOD_WINDOW = -1.0, 0.8, 10  # from the first such window on, a run has converged
-SITUATION = ("setup", "mouth", "material", "target", "receiver_length", "receiver_height")  # tells one from others
 BOTH = "PT0-Rnone, both skills tried"
 MARKERS = {"tip": "o", "shake": "^"}
 
@@ -144,6 +143,13 @@ def converged(run: list[Row]) -> int | None:
     return next((k for k, share in enumerate(shares) if share >= GOOD_SHARE), None)
 
 
+def converged_plans(run: list[Row]) -> int | None:
+    """Return the same if only episodes count in which nothing was drawn: that is what the run knows by then."""
+    planned = [(k, row) for k, row in enumerate(run) if not row["explored"]]
+    place = converged([row for _, row in planned])
+    return None if place is None else planned[place][0]
+
+
 def fitting_skills(row: Row) -> set[str]:
     """Return the skills that fit a situation, as found by trying many actions in the four materials."""
     if row["material"] in ("wat", "bnc"):
@@ -164,29 +170,30 @@ def spread(values: np.ndarray, form: str = ".0f") -> str:
 
 
 def average(rows: list[Row], name: str) -> str:
-    """Return mean ± standard error as text. What happens in one situation counts once, however many runs met it."""
-    values = [np.nanmean(column(same, name)) for same in grouped(rows, *SITUATION).values()]
+    """Return mean ± standard error over situations as text; what several runs did in one of them is averaged first."""
+    values = [np.nanmean(column(same, name)) for same in grouped(rows, "seed").values()]
     return f"{np.mean(values):.2f} ± {np.std(values, ddof=1) / np.sqrt(len(values)):.2f}" if len(values) > 1 else ""
 
 
 def summary(rows: list[Row]) -> dict[str, str | int]:
-    """Return the columns of a table that describe episodes."""
+    """Return the columns of a table that describe episodes. Those that broke off have reached nothing."""
     done = [row for row in rows if row["status"] == "done"]
-    total, first, poured, target = (column(done, name) for name in ("return", "first_return", "poured", "target"))
+    poured, target = column(rows, "poured"), column(rows, "target")
     over = np.array([max(0.0, float(row["poured"]) - float(row["target"])) for row in done if runs_freely(row)])
     named = [row for row in done if row["material"] in MATERIALS]
-    fits = [row["skill"] in fitting_skills(row) for row in named]
     return {
         "episodes": len(rows),
+        "failed": len(rows) - len(done),
         "return": average(done, "return"),
-        "median": f"{np.median(total):.3f}" if done else "",
-        "above -1 [%]": share(total > GOOD_RETURN),
+        "by run": ", ".join(f"{column(run, 'return').mean():.2f}" for run in grouped(done, "run").values()),
+        "median": f"{np.median(column(done, 'return')):.3f}" if done else "",
+        "above -1 [%]": share(column(rows, "return") > GOOD_RETURN),
         "first attempt": average(done, "first_return"),
-        "above -1 [%] ": share(first > GOOD_RETURN),
+        "first above -1 [%]": share(column(rows, "first_return") > GOOD_RETURN),
         "reached [%]": share(poured >= target - 1e-6),
         "spilled": spread(column(done, "spilled") / SPILL_AMOUNT),
         "too much": spread(over / SPHERE_AMOUNT),
-        "skill fits [%]": share(np.array(fits)),
+        "skill fits [%]": share(np.array([row["skill"] in fitting_skills(row) for row in named])),
     }
 
 
@@ -215,6 +222,9 @@ def conditions_table(rows: list[Row]) -> list[dict[str, str | int]]:
             "condition": condition.name,
             "runs": len(runs),
             "converged after": ", ".join("never" if k is None else str(k) for k in when),
+            "counting plans only": ", ".join(
+                "never" if k is None else str(k) for k in (converged_plans(run) for run in runs)
+            ),
         }
         lines.append(about | summary(last_of_runs(rows, condition.setup, condition.name)))
     return lines
@@ -237,17 +247,18 @@ def differences_table(learned: list[Row], baselines: list[Row]) -> list[dict[str
             line: dict[str, str | int] = {"setup": setup, "condition": condition, "against": policy}
             for name, label in (("return", "return"), ("first_return", "first attempt")):
                 pairs = paired(mine, others, name)
-                error = np.std(pairs, ddof=1) / np.sqrt(len(pairs))
-                line |= {"situations": len(pairs), label: f"{np.mean(pairs):.2f} ± {error:.2f}"}
+                if len(pairs) > 1:
+                    error = np.std(pairs, ddof=1) / np.sqrt(len(pairs))
+                    line |= {"situations": len(pairs), label: f"{np.mean(pairs):.2f} ± {error:.2f}"}
             lines.append(line)
     return lines
 
 
 def paired(learned: list[Row], others: list[Row], name: str) -> np.ndarray:
-    """Return the difference of a column in each situation that both met, means over the runs there."""
+    """Return the difference of a column in each situation that both went through, means over the runs there."""
     means = [
-        {where: np.nanmean(column(same, name)) for where, same in grouped(rows, *SITUATION).items()}
-        for rows in (learned, others)
+        {seed: column(same, name).mean() for seed, same in grouped(done, "seed").items()}
+        for done in ([row for row in rows if row["status"] == "done"] for rows in (learned, others))
     ]
     return np.array([means[0][where] - means[1][where] for where in means[0] if where in means[1]])
 
@@ -268,7 +279,7 @@ def main(folder: Annotated[Path, typer.Option(help="Of the files.")] = FOLDER) -
         for name in ("results", "evaluation", "baselines")
     )
     for name, draw in FIGURES.items():
-        figure = draw(results)
+        figure = draw([row for row in results if row["status"] == "done"])
         figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
         figure.savefig(folder / f"{name}.png", dpi=110)
         plt.close(figure)

@@ -57,7 +57,7 @@ def run(
                 go_on,
                 [job for job in jobs if not job.finished],
                 processes,
-                ready=lambda job: job.basis is None or job.basis.finished,
+                after=lambda job: job.basis,
                 look=look,
             )
         finally:

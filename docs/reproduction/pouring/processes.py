@@ -28,7 +28,7 @@ def work(
     jobs: Sequence[Job],
     processes: int,
     *,
-    ready: Callable[[Job], bool] = lambda job: True,
+    after: Callable[[Job], Job | None] = lambda job: None,
     look: Callable[[], None] = lambda: None,
 ) -> None:
     """Do jobs. One that fails lets the others go on; those that wait for it are left undone.
@@ -37,7 +37,7 @@ def work(
         function: called with a job in some process.
         jobs: the first ones first.
         processes: how many.
-        ready: whether a job can be begun.
+        after: the job that must be over before this one is begun, if it is among them.
         look: called every now and then.
 
     Raises:
@@ -47,7 +47,8 @@ def work(
     executor = get_reusable_executor(processes, initializer=_follow, initargs=(os.getpid(),))
     try:
         while True:
-            for job in [job for job in waiting if ready(job)]:
+            failures = [job for job, _ in failed]
+            for job in [job for job in waiting if after(job) not in (*waiting, *running.values(), *failures)]:
                 waiting.remove(job)
                 running[executor.submit(function, job)] = job
             if not running:

@@ -158,6 +158,13 @@ class Run:
         """Whether all are."""
         return self.done >= self.condition.episodes
 
+    @property
+    def ended(self) -> str:
+        """When its last episode ended, UTC, ISO 8601; empty if none has."""
+        with self._store() as store:
+            ended = [] if store is None else self._ended(store)
+        return str(ended[-1].ended) if ended else ""
+
     def loop(self) -> OnlineLoop:
         """Return the loop in its folder; the graph has a bonus in all conditions, so that runs can build on others."""
         size = {"hidden": self.condition.hidden}
@@ -210,6 +217,7 @@ class Run:
             "condition": self.condition.name,
             "run": self.number,
             "episode": number,
+            "seed": episode.seed,
             "status": episode.status,
             **outcome(known, skill, returns),
             "explored": episode.info["explored"].removeprefix("drawn: ").split(":")[0],
@@ -233,7 +241,7 @@ OUTCOME = (
     "return",
 )
 COLUMNS = (
-    *("setup", "condition", "run", "episode", "status"),
+    *("setup", "condition", "run", "episode", "seed", "status"),
     *OUTCOME,
     *("explored", "expected", "simulating", "planning", "fitting"),
 )
@@ -245,7 +253,7 @@ def outcome(known: Mapping[str, Any], skill: str, returns: Sequence[float] | Non
     Args:
         known: all that was observed.
         skill: that was used last.
-        returns: of each attempt, None if the episode broke off.
+        returns: of each attempt; None if the episode broke off, then its amounts are left out too.
     """
     length, _, height = known["receiver_size"]
     values = {
@@ -253,15 +261,19 @@ def outcome(known: Mapping[str, Any], skill: str, returns: Sequence[float] | Non
         "target": known["target"],
         "receiver_length": length,
         "receiver_height": height,
-        # Those of the last attempt, and what earlier ones had poured, spilled and let out.
-        "poured": known["target"] - known["target_change"] + known.get("poured_change", math.nan),
-        "spilled": known["spilled"] + known.get("spilled_change", math.nan),
-        "released": known["released"] + known.get("released_change", math.nan),
-        "first_return": returns[0] if returns else math.nan,
-        "return": math.fsum(returns) if returns else math.nan,
     }
-    named = {"material": name_of(known["material"]), "skill": skill, "attempts": len(returns) if returns else ""}
-    return {**{name: rounded(value) for name, value in values.items()}, **named}
+    named: dict[str, Any] = {"material": name_of(known["material"]), "skill": skill}
+    if returns is not None:
+        # What the last attempt changed, and what earlier ones had poured, spilled and let out.
+        values |= {
+            "poured": known["target"] - known["target_change"] + known["poured_change"],
+            "spilled": known["spilled"] + known["spilled_change"],
+            "released": known["released"] + known["released_change"],
+            "first_return": returns[0],
+            "return": math.fsum(returns),
+        }
+        named["attempts"] = len(returns)
+    return dict.fromkeys(OUTCOME, "") | {name: rounded(value) for name, value in values.items()} | named
 
 
 def rounded(value: float | None) -> str:
