@@ -23,7 +23,7 @@ extensions = [
     "sphinx_gallery.gen_gallery",
 ]
 # The page on pouring waits for its figures; it goes into the toctree of reproduction/index.md with them.
-exclude_patterns = ["_build", "examples", "reproduction/pouring/index.md"]
+exclude_patterns = ["_build", "examples"]
 default_role = "py:obj"  # `name` is code, and a link where the name has a page
 
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist"]
