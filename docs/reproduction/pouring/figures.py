@@ -281,7 +281,6 @@ def main(folder: Annotated[Path, typer.Option(help="Of the files.")] = FOLDER) -
     for name, draw in FIGURES.items():
         figure = draw([row for row in results if row["status"] == "done"])
         figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
-        figure.savefig(folder / f"{name}.png", dpi=110)
         plt.close(figure)
     fresh, met = ([row for row in baselines if (row["run"] == "fresh") == new] for new in (True, False))
     runs = {row["run"] for row in met}
