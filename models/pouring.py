@@ -180,7 +180,7 @@ LIMITS = {"spilled_change": (0.0, 1.0)}
 RESOLUTION = {"relative_position": 0.01, "target_change": 0.005, "receiver_size": 0.01}
 # Of the networks. One narrow layer: from 80 attempts, plans with two layers of 64 units reached less, with three of 200
 # far less, since a search finds the places where a network that bends more is wrong.
-NETWORK = {"hidden": (32,), "propagation": "low-rank"}
+NETWORK = {"hidden": (32,), "propagation": "low-rank", "start": "linear"}
 
 
 def flow_network(skill: str, **options: Any) -> sg.learned.StochasticNetwork:

@@ -92,6 +92,8 @@ class Learner:
         rng: np.random.Generator,
         progress: Progress,
         last_bias: Array | None = None,
+        *,
+        linear: bool = False,
     ) -> tuple[Memory, Training]:
         """Train one network.
 
@@ -106,6 +108,7 @@ class Learner:
             rng: source of randomness.
             progress: to report to.
             last_bias: (m,) where a fit from scratch begins; 0 if left out.
+            linear: whether it begins as a ridge regression; the targets must be scaled.
         """
         count = 1 + schedule.active
         # What does not vary has no part in predictions; a network that saw how it deviates would rely on it.
@@ -117,7 +120,7 @@ class Learner:
             copies = initial_copies(sizes, inputs, count, rng)
             if last_bias is not None:
                 copies.biases[-1][:] = last_bias
-            if scaling[1] is not None:
+            if linear:
                 begin_linear(copies, inputs, targets, schedule.folds)
         steps = default_steps(len(x), max(sizes[1:-1], default=100))
         steps = round(WARM_SHARE * steps) if schedule.warm else steps

@@ -26,6 +26,8 @@ from symgraph.model import Parameter
 from symgraph.progress import Progress
 from symgraph.slots import Array, Gaussian, as_covariance, as_numbers
 
+Start = Literal["random", "linear"]
+STARTS: tuple[Start, ...] = ("random", "linear")
 ErrorModel = Literal["likelihood", "paper", "none"]
 ERROR_MODELS: tuple[ErrorModel, ...] = ("likelihood", "paper", "none")
 HERMITE = 5  # points for the expectation over one output of the error network
@@ -81,6 +83,9 @@ class StochasticNetwork(LearnedModel):
             "quadrature", "diagonal", "paper", "mean".
         error: "likelihood" (default): σ maximises the likelihood of errors on samples that were left out; "paper":
             the paper's asymmetric loss on errors of the training samples; "none": σ = 0.
+        start: where a fit from scratch begins: "random" (default) weights, or "linear", the ridge regression that
+            predicts best the samples that were left out: better where samples are few and inputs many, worse where
+            outliers lie far from all others.
         samples_needed: with fewer, plans that need the network explore.
         resolution: {label: standard deviation, a number or one for each element} up to which an input is taken for a
             constant that carries noise, of which nothing is learned; 0 where left out [units of the inputs].
@@ -100,6 +105,7 @@ class StochasticNetwork(LearnedModel):
         *,
         propagation: str = "auto",
         error: ErrorModel = "likelihood",
+        start: Start = "random",
         samples_needed: int = 3,
         resolution: Mapping[str, Any] | None = None,
         name: str = "network",
@@ -107,6 +113,7 @@ class StochasticNetwork(LearnedModel):
         super().__init__(reads, hidden, propagation, samples_needed, resolution, name)
         self.writes = checked_sizes(writes, f"{self.name}: writes")
         self.error = checked_option(error, ERROR_MODELS, f"{self.name}: error")
+        self.start = checked_option(start, STARTS, f"{self.name}: start")
         sizes = (sum(self.reads.values()), *self.hidden, sum(self.writes.values()))
         self._mean = Perceptron(sizes, f"{self.name}_mean")
         self._error = Perceptron(sizes, f"{self.name}_error")
@@ -180,7 +187,18 @@ class StochasticNetwork(LearnedModel):
         mean_learner, error_learner, error = kept.mean_learner.copied(), kept.error_learner.copied(), kept.error
         with Progress(f"fitting {self.name}", progress) as bar:
             plan = mean_learner.plan(x, y)
-            mean, trained = mean_learner.fit(kept.mean, self._mean.sizes, x, y, scaling, losses.squares, plan, rng, bar)
+            mean, trained = mean_learner.fit(
+                kept.mean,
+                self._mean.sizes,
+                x,
+                y,
+                scaling,
+                losses.squares,
+                plan,
+                rng,
+                bar,
+                linear=self.start == "linear",
+            )
             fitted = Perceptron(self._mean.sizes, "fitted")
             fitted.set(mean.copies, *scaling)
             held_out = scaling[1](y) - trained.outputs
@@ -294,7 +312,7 @@ class StochasticNetwork(LearnedModel):
 
     @property
     def settings(self) -> dict[str, Any]:
-        settings = "name", "reads", "writes", "hidden", "propagation", "error", "samples_needed", "resolution"
+        settings = "name", "reads", "writes", "hidden", "propagation", "error", "start", "samples_needed", "resolution"
         return {name: getattr(self, name) for name in settings}
 
     @classmethod
