@@ -44,13 +44,13 @@ def shares(material: str, skill: str) -> dict[str, float]:
     world = PouringWorld(material, 0.17)
     world.reset(0)
     timers = world.behaviour.simulation.data.timer
-    Attraction.accelerations = timed  # type: ignore[method-assign]
+    Attraction.accelerations = timed  # type: ignore[method-assign]  # to be timed
     begin, cpu = time.perf_counter(), time.process_time()
     try:
         while world.node != "poured":
             world.execute(world.node, ACTIONS, {"skill": skill})
     finally:
-        Attraction.accelerations = plain  # type: ignore[method-assign]
+        Attraction.accelerations = plain  # type: ignore[method-assign]  # as it was
     cpu, total = time.process_time() - cpu, time.perf_counter() - begin
     step = timers[mujoco.mjtTimer.mjTIMER_STEP].duration
     solver = timers[mujoco.mjtTimer.mjTIMER_CONSTRAINT].duration
