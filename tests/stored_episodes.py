@@ -23,7 +23,7 @@ def script(code, *arguments, **options):
 
 
 def output_of(process):
-    out, _ = process.communicate(timeout=60)
+    out, _ = process.communicate(timeout=300)
     assert process.returncode == 0
     return out
 

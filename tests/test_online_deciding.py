@@ -310,6 +310,6 @@ def test_start_points_come_from_the_better_half_of_what_was_done(tmp_path):
         reports = list(one)
         done = sorted((report for report in reports if report.status == "done"), key=lambda report: -report.total)
         assert len(done) == 8
-        starts = one._starts(12, "toy")
-        assert one._starts(12, "another stage") == []
+        starts = one._past.starts(12, "toy")
+        assert one._past.starts(12, "another stage") == []
     assert sorted(start["u"] for start in starts) == sorted(report.actions["u"] for report in done[:4])

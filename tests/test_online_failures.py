@@ -61,11 +61,11 @@ def test_a_failure_that_says_what_it_observed_ends_the_episode_and_not_the_loop(
         assert (stored.status, stored.reason, stored.total) == ("failed", second.reason, -4.0)
         assert stored.info["observed"] == {"spilled": [1.0, 2.0], "z": 9.0}
         assert [spy.samples for spy in spies(one).values()] == [3, 2]  # what the first edge did was learned from
-        assert [past.total is None for past in one._past] == [False, True, False]
+        assert [past.total is None for past in one._past.episodes] == [False, True, False]
         before = told(one.store)
     with loop(tmp_path, chain(), world, 3) as one:
         assert [spy.samples for spy in spies(one).values()] == [3, 2]
-        assert [past.total is None for past in one._past] == [False, True, False]
+        assert [past.total is None for past in one._past.episodes] == [False, True, False]
         assert told(one.store) == before
 
 

@@ -167,7 +167,7 @@ def test_ctrl_c_just_after_something_was_done_changes_nothing(tmp_path, moment, 
 
     def content(one):
         lessons = one._lessons.all.values()
-        starts = [{label: np.array(value) for label, value in start.items()} for start in one._starts(8, "toy")]
+        starts = [{label: np.array(value) for label, value in start.items()} for start in one._past.starts(8, "toy")]
         return (
             told(one.store),
             [(lesson.model.samples, np.array(lesson.x).tolist(), lesson.y) for lesson in lessons],

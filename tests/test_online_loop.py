@@ -99,14 +99,14 @@ def test_performing_and_planning_change_nothing(learned):
     weights = [parameter.value.copy() for model in models.values() for parameter in model.parameters]
     samples = {name: (model.samples, len(one._lessons.all[name].x)) for name, model in models.items()}
     files = {file: file.read_bytes() for file in one.folder.glob("*.safetensors")}
-    before, past = told(one.store), list(one._past)
+    before, past = told(one.store), list(one._past.episodes)
     first, second = (one.perform(kicking(), 5) for _ in range(2))
     plan = one.plan({"s": 0.25, "something else": "ignored"})
     assert (first.total, first.actions, first.selections) == (second.total, second.actions, second.selections)
     assert (first.setup, first.seed, first.status) == ("performed", 5, "done")
     assert sg.solve(sg.Objective(sg.unroll(one.graph)), {"s": 0.25}).value == pytest.approx(plan.value, abs=1e-6)
     assert told(one.store) == before
-    assert one._past == past
+    assert one._past.episodes == past
     assert {name: (model.samples, len(one._lessons.all[name].x)) for name, model in models.items()} == samples
     assert {file: file.read_bytes() for file in one.folder.glob("*.safetensors")} == files
     after = [parameter.value for model in models.values() for parameter in model.parameters]

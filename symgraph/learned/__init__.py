@@ -3,8 +3,9 @@
 from symgraph.learned.branches import BranchNetwork, BranchReport
 from symgraph.learned.calibration import Calibration, PitHistogram, Scores, calibrate
 from symgraph.learned.episodes import Episode, EpisodeStore, Visit
-from symgraph.learned.loop import EpisodeReport, OnlineLoop
+from symgraph.learned.loop import OnlineLoop
 from symgraph.learned.network import FitReport, StochasticNetwork
+from symgraph.learned.report import EpisodeReport
 from symgraph.learned.schedule import Exploration, Stage, World
 
 __all__ = [

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import math
 import os
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from symgraph.errors import InputError, StorageError, did_you_mean, names
 from symgraph.graph import Graph
-from symgraph.learned.deciding import Decider, Notes, Planning
+from symgraph.learned.deciding import Decider, Planning
 from symgraph.learned.episodes import EpisodeStore
 from symgraph.learned.execution import Diverged, Execution, WorldFailed, returns_of
 from symgraph.learned.inputs import checked_count
-from symgraph.learned.knowledge import Knowledge, Known
+from symgraph.learned.knowledge import Knowledge
+from symgraph.learned.past import Past
 from symgraph.learned.records import Visit, checked_whole, shown
+from symgraph.learned.report import EpisodeReport
 from symgraph.learned.samples import Lessons
 from symgraph.learned.schedule import Exploration, Stage, World
 from symgraph.learned.storage import checked_path
@@ -30,76 +30,6 @@ from symgraph.planner import solve
 from symgraph.tree import unroll
 
 STORE = "episodes.sqlite"  # in the folder of a loop
-STARTS = 1  # joined with other numbers, what is drawn for start points
-
-
-@dataclass(frozen=True)
-class EpisodeReport:
-    """What happened in an episode.
-
-    Attributes:
-        number: counted from 0.
-        setup: the name of its stage.
-        seed: that the world was reset with.
-        status: "done", "failed" or "interrupted".
-        reason: why it failed, else empty.
-        returns: of each attempt, from one going through the graph to the next, the sum of its rewards.
-        actions: {label: value} decided last.
-        selections: {label: choice} decided last.
-        expected: {label: mean} of what the last plan promised.
-        value: that the last plan promised.
-        explored: why the last decision was not the best plan, "drawn: selections, actions" or "exploring: …"; empty if
-            it was, but for noise.
-        known: {label: value} of all that was observed, decided or follows from it, the latest.
-        seconds: {"simulating", "planning", "fitting": time} [s].
-    """
-
-    number: int
-    setup: str
-    seed: int
-    status: str
-    reason: str
-    returns: tuple[float, ...]
-    actions: dict[str, Any]
-    selections: dict[str, str]
-    expected: dict[str, Any]
-    value: float
-    explored: str
-    known: Known
-    seconds: dict[str, float]
-
-    @property
-    def attempts(self) -> int:
-        """How often the graph was gone through, at least to its first node."""
-        return len(self.returns)
-
-    @property
-    def total(self) -> float:
-        """The return of the whole episode."""
-        return math.fsum(self.returns)
-
-    def __str__(self) -> str:
-        chosen = ", ".join(f"{label} = {choice}" for label, choice in self.selections.items())
-        parts = [f"{self.setup} {self.number}", chosen, f"return {self.total:.3g}", self.explored]
-        parts += ["" if self.status == "done" else f"{self.status}: {self.reason}"]
-        return "; ".join(part for part in parts if part)
-
-
-@dataclass(frozen=True)
-class _Past:
-    """What is remembered of an episode that is over.
-
-    Attributes:
-        setup: the name of its stage.
-        total: its return; None if it ended early, and may not have come to what it would have been punished for.
-        decision: the last one, {label: value or choice}.
-        selections: {selection: choice} of every plan.
-    """
-
-    setup: str
-    total: float | None
-    decision: dict[str, Any]
-    selections: list[dict[str, str]]
 
 
 class OnlineLoop:
@@ -154,7 +84,8 @@ class OnlineLoop:
         attempts = checked_count(attempts, "attempts")
         if again is None and attempts > 1:
             raise InputError(f"attempts = {attempts}, but nothing leads back; say with `again` where an attempt ends")
-        seed, self._remembered = checked_whole(seed, "seed"), checked_whole(remembered, "remembered")
+        seed = checked_whole(seed, "seed")
+        self._past = Past(seed, checked_whole(remembered, "remembered"))
         self._models = ModelNumbers()
         self._planning = Planning(
             graph,
@@ -165,7 +96,6 @@ class OnlineLoop:
             seed,
         )
         self._lessons = Lessons(graph, {} if limits is None else limits, self.folder, seed)
-        self._past: list[_Past] = []
         # How many episodes are taken over, and samples of each model then. Changed at once, so that an exception at any
         # moment leaves what can be gone on from.
         self._taken = 0, self._lessons.counts()
@@ -201,7 +131,7 @@ class OnlineLoop:
             "decisions": list(self.decisions),
             "again": self._planning.again,
             "attempts": self._planning.attempts,
-            "remembered": self._remembered,
+            "remembered": self._past.remembered,
             "seed": self._planning.seed,
         }
 
@@ -239,7 +169,7 @@ class OnlineLoop:
             given: {label: value} of states that it does not observe.
         """
         knowledge = self._knowledge()
-        decider = Decider(self._planning, knowledge, 0, Exploration(episodes=0).at(0), self._starts(0, None))
+        decider = Decider(self._planning, knowledge, 0, Exploration(episodes=0).at(0), self._past.starts(0, None))
         execution = Execution(self.graph, world, knowledge, 0)
         status, reason = "done", ""
         try:
@@ -280,8 +210,8 @@ class OnlineLoop:
             knowledge,
             number,
             stage.explore.at(within),
-            self._starts(number, stage.name),
-            [selections for past in self._past for selections in past.selections],
+            self._past.starts(number, stage.name),
+            self._past.selections,
             plans,
             lambda step, notes: self.store.note_plan(number, step, notes),
         )
@@ -320,7 +250,7 @@ class OnlineLoop:
         if status == "failed":
             info["observed"] = observed
         self.store.end(number, status, total=report.total, reason=reason, seconds=report.seconds, info=info)
-        self._remember(stage.name, status, report.total, decider.plans)
+        self._past.add(stage.name, status, report.total, decider.plans)
         self._taken = number + 1, self._lessons.counts()
         return report
 
@@ -350,13 +280,13 @@ class OnlineLoop:
         """Take over, from the store, the episodes before a number, and nothing else."""
         over, counts = self._taken
         self._lessons.rewind(counts)
-        del self._past[over:]
+        self._past.rewind(over)
         for episode in self.store.episodes()[over:number] if over < number else ():
             visits = self.store.visits(episode.number)
             knowledge = self._knowledge()
             knowledge.take_over(visits)
             self._lessons.take(visits, visits, knowledge)
-            self._remember(episode.setup, episode.status, episode.total, self.store.plans(episode.number))
+            self._past.add(episode.setup, episode.status, episode.total, self.store.plans(episode.number))
         self._taken = number, self._lessons.counts()
 
     def _stage_of(self, number: int) -> tuple[Stage, int]:
@@ -369,21 +299,6 @@ class OnlineLoop:
 
     def _knowledge(self) -> Knowledge:
         return Knowledge(self.graph, self._models, self.decisions)
-
-    def _remember(self, setup: str, status: str, total: float | None, plans: Mapping[int, Notes]) -> None:
-        last: Notes = plans[max(plans)] if plans else {"actions": {}, "selections": {}}
-        counts = status == "done" and bool(plans) and total is not None and math.isfinite(total)
-        decision = {**last["actions"], **last["selections"]}
-        self._past.append(_Past(setup, total if counts else None, decision, [p["selections"] for p in plans.values()]))
-
-    def _starts(self, number: int, setup: str | None) -> list[dict[str, Any]]:
-        """Draw start points from the better half of the past episodes of a stage, of all stages if None."""
-        done = [
-            (past.total, past.decision) for past in self._past if past.total is not None and setup in (None, past.setup)
-        ]
-        better = sorted(done, key=lambda one: -one[0])[: (len(done) + 1) // 2]
-        rng = np.random.default_rng([self._planning.seed, number, STARTS])
-        return [better[i][1] for i in rng.permutation(len(better))[: self._remembered]]
 
 
 def _checked_nodes(graph: Graph, decisions: Any, again: Any) -> list[str]:
