@@ -174,6 +174,9 @@ def _square_above_zero(mean: ca.MX, variance: ca.MX) -> ca.MX:
 # Each trial is planned anew when the source is at the receiver. After "poured" the world may lead there again: until
 # the target is reached, or the source is empty, or it has tried often enough.
 TRIALS = {"decisions": ("at_receiver",), "again": "poured", "attempts": 4}
+# Most is learned near the plans, if what is tried reaches far enough beside them. Returns above -1 in the last 20 of 80
+# episodes, 8 runs: 90% with these, 81% with 0.5 and 0.15 as with 1.0 and 0.1; 76% with 0.0 and 0.2 (4 runs).
+EXPLORATION = {"actions": 0.15, "noise": 0.2}
 # Single accidents spill 30 to 70 spheres; learned as they are, nothing else would count. [amount]
 LIMITS = {"spilled_change": (0.0, 1.0)}
 # Standard deviations below which what is observed is noise [length, amount].

@@ -170,6 +170,27 @@ def test_exploration_draws_as_often_as_it_says(tmp_path):
             assert action == pytest.approx(best[skill], abs=1e-3)
 
 
+def test_each_choice_is_drawn_in_each_kind_of_situation(tmp_path):
+    """Plans are always "far": what is drawn makes "near" known where s is small and where it is large."""
+    places = {}
+
+    def start(seed):
+        return {"s": 0.2 + 10.0 * (seed % 2) + 1e-3 * (seed % 7)}
+
+    def aim(actions, selections, world):
+        place = world.seeds[-1] % 2
+        places.setdefault(place, []).append(selections["skill"])
+        return {f"{selections['skill']}_end": {"y": 0.5}}
+
+    explore = Exploration(selections=0.5, actions=0.0, noise=0.0, episodes=ALWAYS)
+    spies = Spy({"u": 1, "s": 1}, {"y": 1}, "near"), Spy({"u": 1, "s": 1}, {"y": 1}, "far")
+    with loop(tmp_path, kick_graph(*spies), Scripted(start, {"aim": aim}), 60, explore) as one:
+        drawn = [report.explored != "" for report in one]
+    assert is_share(sum(drawn), 60, 0.5)
+    for made in places.values():
+        assert 0.2 <= made.count("near") / len(made) <= 0.8
+
+
 def test_choices_that_fail_count_as_made(tmp_path):
     def aim(actions, selections, world):
         if selections["skill"] == "near":

@@ -46,7 +46,7 @@ SETUPS = {
     },
 }
 PROOFS = 6  # situations at the end that it has never met
-EXPLORED = 48  # episodes in which it tries something beside its plans, less often each time
+EXPLORED = 60  # episodes in which it tries something beside its plans, less often each time
 
 # %%
 # The task and the loop
@@ -61,7 +61,7 @@ def loop_in(world, name, episodes, seed, folder):
     graph = pouring.graph(pouring.flow_network("tip"), pouring.flow_network("shake"), pouring.amount_network())
     return sg.learned.OnlineLoop(
         graph,
-        [sg.learned.Stage(name, world, episodes, sg.learned.Exploration(episodes=EXPLORED))],
+        [sg.learned.Stage(name, world, episodes, sg.learned.Exploration(episodes=EXPLORED, **pouring.EXPLORATION))],
         folder,
         **pouring.TRIALS,
         limits=pouring.LIMITS,

@@ -13,13 +13,14 @@ import numpy as np
 from symgraph.graph import Graph
 from symgraph.learned.execution import Decision
 from symgraph.learned.knowledge import Knowledge
+from symgraph.learned.novelty import Try, least_known, situation_of
 from symgraph.learned.records import Visit
 from symgraph.learned.schedule import Exploration
 from symgraph.objective import Objective
 from symgraph.optimizers.problem import Optimizer
 from symgraph.plan import Plan
 from symgraph.planner import solve
-from symgraph.slots import Action
+from symgraph.slots import Action, Array
 from symgraph.tree import Tree
 
 Notes = dict[str, Any]  # what is stored of a plan
@@ -37,6 +38,7 @@ class Planning:
         again: a node at which the graph ends but from which the world may lead back to an earlier one.
         attempts: how often the graph is gone through, at most.
         seed: of all that is random.
+        informative: states that tell situations apart, in which a choice may be known or not.
     """
 
     graph: Graph
@@ -45,6 +47,7 @@ class Planning:
     again: str | None
     attempts: int
     seed: int
+    informative: tuple[str, ...]
 
 
 class Decider:
@@ -56,7 +59,7 @@ class Decider:
         number: of the episode.
         explore: how much is tried in this episode.
         starts: decisions of other episodes, to start searches from.
-        made: {selection: choice} of every plan of other episodes; what is drawn is among what was chosen least often.
+        tries: where plans of other episodes chose what; what is drawn is what is known least, see `least_known`.
         recalled: {step: notes} of plans that were made before.
         note: called with the step and the notes of every new plan.
 
@@ -75,7 +78,7 @@ class Decider:
         number: int,
         explore: Exploration,
         starts: Sequence[Mapping[str, Any]] = (),
-        made: Sequence[Mapping[str, str]] = (),
+        tries: Sequence[Try] = (),
         recalled: Mapping[int, Notes] | None = None,
         note: Callable[[int, Notes], None] = lambda step, notes: None,
     ) -> None:
@@ -84,7 +87,7 @@ class Decider:
         self._number = number
         self._explore = explore
         self._starts = list(starts)
-        self._made = list(made)
+        self._tries = list(tries)
         self._recalled = recalled or {}
         self._note = note
         self._fixed: dict[str, Any] = {}
@@ -109,7 +112,7 @@ class Decider:
         """Return the actions and selections with which a visit's node is left."""
         if visit.parent is None or visit.parent in self._ends:
             self._ends.discard(-1 if visit.parent is None else visit.parent)
-            self._begin_attempt()
+            self._begin_attempt(visit)
         if visit.node in self._planning.objectives:
             begin = time.perf_counter()
             if visit.step in self._recalled:
@@ -133,14 +136,17 @@ class Decider:
         actions = {k: np.array(v) if isinstance(v, list) else v for k, v in notes["actions"].items()}
         self.decision = actions, dict(notes["selections"])
 
-    def _begin_attempt(self) -> None:
+    def _begin_attempt(self, visit: Visit) -> None:
         """Draw what is tried in an attempt, all of whose decisions keep to it."""
         graph = self._planning.graph
         rng = np.random.default_rng([self._planning.seed, self._number, self.attempts, DRAWS])
         self.attempts += 1
         draws_selections, draws_actions = rng.random(2) < (self._explore.selections, self._explore.actions)
+        situation = _situation(self._planning, self._knowledge, visit.step)
+        tries = [*self._tries, *tries_of(self._planning, self._knowledge, self.plans)]
         selections = {
-            label: str(rng.choice(self._rare(label, slot.choices))) for label, slot in graph.selections().items()
+            label: str(rng.choice(least_known(label, slot.choices, situation, tries)))
+            for label, slot in graph.selections().items()
         }
         actions = {label: rng.uniform(slot.lower, slot.upper) for label, slot in graph.actions().items()}
         self._fixed = {**(selections if draws_selections else {}), **(actions if draws_actions else {})}
@@ -148,13 +154,6 @@ class Decider:
             label: self._explore.noise * rng.standard_normal(slot.size) * (slot.upper - slot.lower)
             for label, slot in graph.actions().items()
         }
-
-    def _rare(self, label: str, choices: Sequence[str]) -> list[str]:
-        """Return the choices of a selection that were made least often, so that no skill stays unknown."""
-        here = (notes["selections"] for notes in self.plans.values())
-        made = [selections.get(label) for selections in (*self._made, *here)]
-        fewest = min(made.count(choice) for choice in choices)
-        return [choice for choice in choices if made.count(choice) == fewest]
 
     def _planned(self, visit: Visit) -> Notes:
         """Plan at a visit's node, and return what is decided and expected."""
@@ -199,6 +198,15 @@ class Decider:
             return value
         column = np.clip(value + self._disturbance[label], slot.lower, slot.upper)
         return float(column[0]) if slot.size == 1 else column
+
+
+def tries_of(planning: Planning, knowledge: Knowledge, plans: Mapping[int, Notes]) -> list[Try]:
+    """Return where {step: notes} of an episode's plans chose what."""
+    return [(_situation(planning, knowledge, step), notes["selections"]) for step, notes in plans.items()]
+
+
+def _situation(planning: Planning, knowledge: Knowledge, step: int) -> Array:
+    return situation_of(planning.graph, planning.informative, knowledge.at[step], knowledge.at[0])
 
 
 def _ahead(tree: Tree) -> set[str]:

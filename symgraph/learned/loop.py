@@ -11,7 +11,7 @@ import numpy as np
 
 from symgraph.errors import InputError, StorageError, did_you_mean, names
 from symgraph.graph import Graph
-from symgraph.learned.deciding import Decider, Planning
+from symgraph.learned.deciding import Decider, Planning, tries_of
 from symgraph.learned.episodes import EpisodeStore
 from symgraph.learned.execution import Diverged, Execution, WorldFailed, returns_of
 from symgraph.learned.inputs import checked_count
@@ -87,6 +87,7 @@ class OnlineLoop:
         seed = checked_whole(seed, "seed")
         self._past = Past(seed, checked_whole(remembered, "remembered"))
         self._models = ModelNumbers()
+        self._lessons = Lessons(graph, {} if limits is None else limits, self.folder, seed)
         self._planning = Planning(
             graph,
             {node: Objective(unroll(graph, start=node)) for node in self.decisions},
@@ -94,8 +95,8 @@ class OnlineLoop:
             again,
             attempts,
             seed,
+            tuple(self._lessons.reads),
         )
-        self._lessons = Lessons(graph, {} if limits is None else limits, self.folder, seed)
         # How many episodes are taken over, and samples of each model then. Changed at once, so that an exception at any
         # moment leaves what can be gone on from.
         self._taken = 0, self._lessons.counts()
@@ -211,7 +212,7 @@ class OnlineLoop:
             number,
             stage.explore.at(within),
             self._past.starts(number, stage.name),
-            self._past.selections,
+            self._past.tries,
             plans,
             lambda step, notes: self.store.note_plan(number, step, notes),
         )
@@ -250,7 +251,8 @@ class OnlineLoop:
         if status == "failed":
             info["observed"] = observed
         self.store.end(number, status, total=report.total, reason=reason, seconds=report.seconds, info=info)
-        self._past.add(stage.name, status, report.total, decider.plans)
+        tries = tries_of(self._planning, knowledge, decider.plans)
+        self._past.add(stage.name, status, report.total, decider.plans, tries)
         self._taken = number + 1, self._lessons.counts()
         return report
 
@@ -286,7 +288,9 @@ class OnlineLoop:
             knowledge = self._knowledge()
             knowledge.take_over(visits)
             self._lessons.take(visits, visits, knowledge)
-            self._past.add(episode.setup, episode.status, episode.total, self.store.plans(episode.number))
+            plans = self.store.plans(episode.number)
+            tries = tries_of(self._planning, knowledge, plans)
+            self._past.add(episode.setup, episode.status, episode.total, plans, tries)
         self._taken = number, self._lessons.counts()
 
     def _stage_of(self, number: int) -> tuple[Stage, int]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from symgraph.learned.deciding import Notes
+from symgraph.learned.novelty import Try
 
 STARTS = 1  # joined with other numbers, what is drawn for start points
 
@@ -22,13 +23,13 @@ class PastEpisode:
         setup: the name of its stage.
         total: its return; None if it ended early, and may not have come to what it would have been punished for.
         decision: the last one, {label: value or choice}.
-        selections: {selection: choice} of every plan.
+        tries: situation and selections of every plan.
     """
 
     setup: str
     total: float | None
     decision: dict[str, Any]
-    selections: list[dict[str, str]]
+    tries: list[Try]
 
 
 class Past:
@@ -45,17 +46,18 @@ class Past:
         self.episodes: list[PastEpisode] = []
 
     @property
-    def selections(self) -> list[dict[str, str]]:
-        """{selection: choice} of every plan of every episode."""
-        return [selections for episode in self.episodes for selections in episode.selections]
+    def tries(self) -> list[Try]:
+        """Situation and selections of every plan of every episode."""
+        return [one for episode in self.episodes for one in episode.tries]
 
-    def add(self, setup: str, status: str, total: float | None, plans: Mapping[int, Notes]) -> None:
-        """Remember an episode, given {step: notes} of its plans."""
+    def add(
+        self, setup: str, status: str, total: float | None, plans: Mapping[int, Notes], tries: Sequence[Try]
+    ) -> None:
+        """Remember an episode, given {step: notes} of its plans, and where they were made."""
         last: Notes = plans[max(plans)] if plans else {"actions": {}, "selections": {}}
         counts = status == "done" and bool(plans) and total is not None and math.isfinite(total)
         decision = {**last["actions"], **last["selections"]}
-        selections = [notes["selections"] for notes in plans.values()]
-        self.episodes.append(PastEpisode(setup, total if counts else None, decision, selections))
+        self.episodes.append(PastEpisode(setup, total if counts else None, decision, list(tries)))
 
     def rewind(self, count: int) -> None:
         """Forget all episodes but the first so many."""

@@ -53,6 +53,10 @@ class Lessons:
         folder: of the files `<name>.safetensors`.
         seed: of the fits.
 
+    Attributes:
+        all: {name of the model: its lesson}.
+        reads: the states that learned models read.
+
     Raises:
         InputError: two models of the same name or file, a model that lacks something, branches that nobody can tell
             apart, limits that do not fit.
@@ -63,7 +67,8 @@ class Lessons:
         self._limits = _checked_limits(limits, graph)
         self._folder = folder
         self._seed = seed
-        self.all: dict[str, Lesson] = {}  # by the model's name
+        self.all: dict[str, Lesson] = {}
+        reads: list[str] = []
         for bound in _bound_models(graph):
             model = bound.learner
             if model is None:
@@ -74,6 +79,7 @@ class Lessons:
                     f"{bound.place} has a method 'fit' but no {(lacks or ['parameters'])[0]!r}; see StochasticNetwork, "
                     f"or take 'fit' away to use it as it is"
                 )
+            reads += bound.reads
             known = self.all.setdefault(model.name, Lesson(model))
             if known.model.parameters[0] is not model.parameters[0]:  # a view under another rule shares its weights
                 raise InputError(f"two learned models are named {model.name!r}; give each a name of its own")
@@ -85,6 +91,7 @@ class Lessons:
                     f"{self.file_of(name).name}; give them names that differ in letters or digits"
                 )
         _check_told_apart(graph)
+        self.reads = [label for label in dict.fromkeys(reads) if label in graph.states()]
 
     def restore(self) -> None:
         """Take over the models that the folder holds."""

@@ -45,8 +45,8 @@ class Exploration:
     Beside it, `solve` explores by itself while a model has too few samples.
 
     Args:
-        selections: probability that an attempt's selections are drawn instead of planned, among the choices that plans
-            made least often so far, in the first episode.
+        selections: probability that an attempt's selections are drawn instead of planned, in the first episode: the
+            choice whose nearest try lies farthest from the situation, as learned models see it.
         actions: probability that its actions are drawn from their whole range, in the first episode.
         noise: standard deviation of what is otherwise added to each action, as a share of its range, in the first
             episode.

@@ -1,0 +1,84 @@
+"""Which choice is known least in a situation."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from online_worlds import kick_graph
+
+from symgraph.learned.novelty import least_known, situation_of
+
+SKILLS = ("tip", "shake")
+
+
+def tries_of(*pairs):
+    return [(np.array(where, dtype=float), {"skill": skill}) for where, skill in pairs]
+
+
+def least(here, *pairs):
+    return least_known("skill", SKILLS, np.array(here, dtype=float), tries_of(*pairs))
+
+
+def test_without_tries_no_choice_is_known():
+    assert least([0.0]) == ["tip", "shake"]
+
+
+def test_a_choice_that_was_never_made_is_known_least():
+    assert least([0.0], ([0.0], "tip")) == ["shake"]
+    assert least([5.0], ([0.0], "tip"), ([0.1], "tip")) == ["shake"]
+
+
+def test_what_is_known_elsewhere_is_not_known_here():
+    paste = [([1.0, 0.1 * k], "tip") for k in range(9)]
+    water = [([0.0, 0.5], "shake")]
+    assert least([0.0, 0.5], *paste, *water) == ["tip"]  # for all that it was made nine times as often
+    assert least([1.0, 0.5], *paste, *water) == ["shake"]
+
+
+def test_where_all_situations_are_the_same_choices_take_turns():
+    tries = []
+    for _ in range(10):
+        found = least([0.3], *tries)
+        tries.append(([0.3], found[0]))
+    assert [skill for _, skill in tries].count("tip") == 5
+    assert len(least([0.3], *tries)) == 2
+
+
+def test_elements_that_are_not_known_do_not_count():
+    pairs = ([np.nan, 0.0], "tip"), ([3.0, 1.0], "shake")
+    assert least([100.0, 0.9], *pairs) == ["shake"]
+    assert least([3.0, 0.9], *pairs) == ["tip"]
+    assert least([np.nan, 0.9], *pairs) == ["tip"]
+    assert least([np.nan, np.nan], *pairs) == ["tip", "shake"]
+
+
+numbers = st.integers(-8, 8).map(float)
+situations = st.lists(numbers, min_size=2, max_size=2)
+
+
+@given(
+    situations,
+    st.lists(st.tuples(situations, st.sampled_from(SKILLS)), min_size=1, max_size=12),
+    st.sampled_from([0.25, 2.0, 64.0]),
+    st.integers(-4, 4),
+)
+def test_units_do_not_matter(here, pairs, scale, offset):
+    def in_other_units(where):
+        return [where[0] * scale + offset, where[1]]
+
+    nearest = {
+        skill: min((np.hypot(*(np.subtract(where, here))) for where, one in pairs if one == skill), default=np.inf)
+        for skill in SKILLS
+    }
+    found = least(here, *pairs)
+    assert found
+    if 0.0 in nearest.values() and len(set(nearest.values())) == 2 and len({tuple(where) for where, _ in pairs}) > 2:
+        assert all(nearest[skill] > 0.0 for skill in found)
+    other = least(in_other_units(here), *[(in_other_units(where), skill) for where, skill in pairs])
+    assert set(other) & set(found)  # ties may break by rounding
+
+
+def test_only_what_is_known_at_the_start_tells_situations_apart():
+    graph = kick_graph()
+    known = {"s": 0.2, "y": 3.0}
+    np.testing.assert_array_equal(situation_of(graph, ["s", "y"], known, {"s": 0.1}), [0.2, np.nan])
+    assert situation_of(graph, [], known, {}).shape == (0,)
