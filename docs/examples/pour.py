@@ -58,7 +58,7 @@ EXPLORED = 60  # episodes in which it tries something beside its plans, less oft
 
 
 def loop_in(world, name, episodes, seed, folder):
-    graph = pouring.graph(pouring.flow_network("tip"), pouring.flow_network("shake"), pouring.amount_network())
+    graph = pouring.graph(*pouring.networks())
     return sg.learned.OnlineLoop(
         graph,
         [sg.learned.Stage(name, world, episodes, sg.learned.Exploration(episodes=EXPLORED, **pouring.EXPLORATION))],

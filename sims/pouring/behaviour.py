@@ -45,6 +45,9 @@ class Phase(enum.Enum):
     READY = "ready"
     TIPPED = "tipped"
     SHAKEN = "shaken"
+    TIP_BOUNDED = "tip_bounded"
+    SHAKE_BOUNDED = "shake_bounded"
+    RELEASED = "released"
     LANDED = "landed"
     POURED = "poured"
 
@@ -55,8 +58,11 @@ TRANSITIONS = {
     Phase.AT_RECEIVER: (Phase.AT_POUR,),
     Phase.AT_POUR: (Phase.READY,),
     Phase.READY: (Phase.TIPPED, Phase.SHAKEN),
-    Phase.TIPPED: (Phase.LANDED,),
-    Phase.SHAKEN: (Phase.LANDED,),
+    Phase.TIPPED: (Phase.TIP_BOUNDED,),
+    Phase.SHAKEN: (Phase.SHAKE_BOUNDED,),
+    Phase.TIP_BOUNDED: (Phase.RELEASED,),
+    Phase.SHAKE_BOUNDED: (Phase.RELEASED,),
+    Phase.RELEASED: (Phase.LANDED,),
     Phase.LANDED: (Phase.POURED,),
     Phase.POURED: (Phase.AT_RECEIVER,),
 }
@@ -179,6 +185,14 @@ class Behaviour:
         """Pour by shaking, and turn back."""
         self._pour(Shake(self.simulation.command, tilt_rate, speed, length, angle))
         self._enter(Phase.SHAKEN)
+
+    def bound(self) -> None:
+        """Let it be known what bounds the amount: nothing is done, so that a model can say so."""
+        self._enter(Phase.TIP_BOUNDED if self.phase is Phase.TIPPED else Phase.SHAKE_BOUNDED)
+
+    def release(self) -> None:
+        """Count what has left the source."""
+        self._enter(Phase.RELEASED)
 
     def land(self) -> None:
         """Let what is in the air come to rest."""

@@ -58,7 +58,7 @@ def totals(behaviour: Behaviour) -> Observation:
 
 
 def flow(behaviour: Behaviour) -> Observation:
-    """How much left the source in this trial, and where and how widely it came down at the height of the rim.
+    """Where and how widely the flow of this trial came down at the height of the rim.
 
     If nothing flowed, the centre is the middle of the mouth where the skill ended: the place it would have
     left from.
@@ -67,10 +67,15 @@ def flow(behaviour: Behaviour) -> Observation:
     landings = census.landings
     centre = landings.mean(axis=0) if len(landings) else np.array([trial.mouth, 0.0])
     return {
-        "released_change": SPHERE_AMOUNT * (SPHERES - census.in_source - trial.released),
         "flow_centre": centre,
         "flow_variance": float(((landings - centre) ** 2).sum(axis=1).mean()) if len(landings) else 0.0,
     }
+
+
+def released(behaviour: Behaviour) -> Observation:
+    """How much left the source in this trial."""
+    census, trial = behaviour.census, behaviour.trial
+    return {"released_change": SPHERE_AMOUNT * (SPHERES - census.in_source - trial.released)}
 
 
 def changes(behaviour: Behaviour) -> Observation:

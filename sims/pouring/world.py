@@ -44,8 +44,10 @@ class PouringWorld:
 
     An episode goes from node to node::
 
-        start -> grasped -> at_receiver -> at_pour -> ready -> tipped | shaken -> landed -> poured -> at_receiver ...
+        start -> grasped -> at_receiver -> at_pour -> ready -> tipped | shaken
                        \-> receiver_moved
+
+        -> tip_bounded | shake_bounded -> released -> landed -> poured -> at_receiver ...
 
     `reset` returns what is observed at "start"; `execute` does what leaves a node and returns what was
     observed on the way to each node that it leads to. After "poured", the trial loop leads to "at_receiver"
@@ -156,7 +158,10 @@ class PouringWorld:
         except SimulationFailed as failure:
             self.end = End.FAILED
             failure.observed |= (
-                observation.totals(behaviour) | observation.flow(behaviour) | observation.changes(behaviour)
+                observation.totals(behaviour)
+                | observation.flow(behaviour)
+                | observation.released(behaviour)
+                | observation.changes(behaviour)
             )
             raise
         # The first way to the waypoint is no command; where that is low, the floor raises the tilting source a little.
@@ -258,6 +263,14 @@ class PouringWorld:
             raise ValueError(f"node {self.node!r}: selection 'skill' is {skill!r}; choose from {list(SKILLS)}")
         return {self.node: observation.flow(self.behaviour)}
 
+    def _bound(self, actions: Actions, selections: Selections) -> dict[str, Observation]:
+        self.behaviour.bound()
+        return {self.node: {}}
+
+    def _release(self, actions: Actions, selections: Selections) -> dict[str, Observation]:
+        self.behaviour.release()
+        return {"released": observation.released(self.behaviour)}
+
     def _land(self, actions: Actions, selections: Selections) -> dict[str, Observation]:
         self.behaviour.land()
         return {"landed": {}}
@@ -280,8 +293,11 @@ _EDGES = {
     Phase.AT_RECEIVER: PouringWorld._move_to_pour,
     Phase.AT_POUR: PouringWorld._get_ready,
     Phase.READY: PouringWorld._pour,
-    Phase.TIPPED: PouringWorld._land,
-    Phase.SHAKEN: PouringWorld._land,
+    Phase.TIPPED: PouringWorld._bound,
+    Phase.SHAKEN: PouringWorld._bound,
+    Phase.TIP_BOUNDED: PouringWorld._release,
+    Phase.SHAKE_BOUNDED: PouringWorld._release,
+    Phase.RELEASED: PouringWorld._land,
     Phase.LANDED: PouringWorld._measure,
     Phase.POURED: PouringWorld._try_again,
 }

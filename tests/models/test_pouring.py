@@ -10,8 +10,8 @@ from small_tasks import objective_of
 import symgraph as sg
 from models import pouring
 from sims.pouring import ACTIONS, SKILLS, PouringWorld
-from sims.pouring.behaviour import Phase
-from sims.pouring.geometry import Receiver
+from sims.pouring.behaviour import SPHERE_AMOUNT, SPILLS, Phase
+from sims.pouring.geometry import SPHERES, Receiver
 
 # The reward of amounts
 
@@ -166,20 +166,26 @@ def test_a_graph_pays_the_reward_of_its_states():
 # A stand-in for the networks: what flows grows with the rates, and spills where it does not come down in the middle
 
 
-def flow_tip(tilt_rate, search_rate, relative_position):
+def flow_tip(tilt_rate, relative_position):
     return {
-        "released_change": 12 * tilt_rate + 40 * search_rate,
         "flow_centre": ca.vertcat(relative_position[0] + 0.2, relative_position[1]),
         "flow_variance": 100 * (tilt_rate - 0.013) ** 2,
     }
 
 
-def flow_shake(shake_speed, shake_stroke, relative_position):
+def flow_shake(shake_stroke, relative_position):
     return {
-        "released_change": 0.2 * shake_speed + 0.5 * shake_stroke[0],
         "flow_centre": ca.vertcat(relative_position[0] + 0.2 + 0.05 * ca.sin(shake_stroke[1]), relative_position[1]),
         "flow_variance": 0.001,
     }
+
+
+def release_tip(tilt_rate, search_rate):
+    return {"released_change": 12 * tilt_rate + 40 * search_rate}
+
+
+def release_shake(shake_speed, shake_stroke):
+    return {"released_change": 0.2 * shake_speed + 0.5 * shake_stroke[0]}
 
 
 def amount(released_change, flow_centre, flow_variance):
@@ -188,11 +194,12 @@ def amount(released_change, flow_centre, flow_variance):
 
 
 def plain_graph(**options):
-    return pouring.graph(flow_tip, flow_shake, amount, **options)
+    flow, release = {"tip": flow_tip, "shake": flow_shake}, {"tip": release_tip, "shake": release_shake}
+    return pouring.graph(flow, release, amount, **options)
 
 
 def network_graph():
-    return pouring.graph(pouring.flow_network("tip"), pouring.flow_network("shake"), pouring.amount_network())
+    return pouring.graph(*pouring.networks())
 
 
 # The model and the world
@@ -265,8 +272,8 @@ def test_the_world_observes_all_that_is_written(episode):
     assert {group.kind for groups in graph.groups.values() for group in groups} == {"edge", "choose", "reward"}
     for node, groups in graph.groups.items():
         for branch in (branch for group in groups for branch in group.branches):
-            # What misses the receiver is no observation; it follows from the flow.
-            if branch.target not in (None, "landed") and branch.model is not None:
+            # What misses the receiver, and what that ends, is no observation; it follows from the flow.
+            if branch.target not in (None, "tip_bounded", "shake_bounded", "landed") and branch.model is not None:
                 assert set(branch.model.writes) <= set(episode[branch.target]), (node, branch.target)
                 for label in branch.model.writes:
                     assert np.size(episode[branch.target][label]) == graph.slots[label].size
@@ -306,15 +313,49 @@ def test_what_misses_the_receiver_is_the_share_of_a_gaussian_beside_it():
     rng = np.random.default_rng(0)
     size = np.array([0.3, 0.4, 0.2])
     for centre, variance in (([0.0, 0.0], 0.004), ([0.12, -0.03], 0.01), ([-0.2, 0.1], 0.001), ([0.5, 0.0], 0.0)):
-        said = {k: float(v) for k, v in pouring.land(ca.DM(centre), variance, 0.4, ca.DM(size)).items()}
+        said = {k: float(v) for k, v in pouring.bound(ca.DM(centre), variance, 0.3, 0.1, ca.DM(size)).items()}
         points = centre + np.sqrt(variance / 2 + 0.03**2) * rng.standard_normal((200_000, 2))
         share = 1 - np.mean(np.all(np.abs(points) < size[:2] / 2, axis=1))
         assert said["missed"] == pytest.approx(share, abs=4e-3)
-        assert said["missed_change"] == pytest.approx(0.4 * said["missed"], abs=1e-12)
-    below = pouring.land(ca.DM([0.0, 0.0]), -0.001, 0.4, ca.DM(size))  # networks may say that
-    assert float(below["missed"]) == pytest.approx(
-        float(pouring.land(ca.DM([0.0, 0.0]), 0, 0.4, ca.DM(size))["missed"])
+        assert float(pouring.land(said["missed"], 0.4)["missed_change"]) == pytest.approx(0.4 * said["missed"])
+    below = pouring.bound(ca.DM([0.0, 0.0]), -0.001, 0.3, 0.1, ca.DM(size))  # networks may say that
+    at_zero = pouring.bound(ca.DM([0.0, 0.0]), 0, 0.3, 0.1, ca.DM(size))
+    assert float(below["missed"]) == pytest.approx(float(at_zero["missed"]))
+
+
+def stop(centre, target=0.3, released=0.0):
+    said = pouring.bound(ca.DM([centre, 0.0]), 0.002, target, released, ca.DM([0.3, 0.4, 0.2]))
+    return float(said["missed"]), float(said["stop_amount"])
+
+
+def test_a_skill_ends_at_the_target_or_after_ten_spills_or_where_the_source_is_empty():
+    missed, amount = stop(0.0)
+    assert missed < 0.01
+    assert amount == pytest.approx(0.3 / (1 - missed))
+    missed, amount = stop(0.16)
+    assert 0.4 < missed < 0.7
+    assert amount == pytest.approx(10 * SPHERE_AMOUNT / missed)
+    assert stop(0.0, target=0.4, released=0.35)[1] == pytest.approx(0.2)
+    missed, amount = stop(5.0)  # nothing is hit
+    assert missed == pytest.approx(1.0)
+    assert amount == pytest.approx(0.055)
+    assert pytest.approx(SPILLS * SPHERE_AMOUNT) == pouring.STOP_SPILLED
+    assert pytest.approx(SPHERES * SPHERE_AMOUNT) == pouring.FULL
+
+
+def test_a_skill_ends_in_the_world_where_the_model_says():
+    """Water flows freely: what has left the source is what ends the skill, and the few spheres in the air by then."""
+    world = PouringWorld("wat", 0.16, target=0.2, receiver_x=0.7)
+    known = world.reset(0)
+    while world.node != "landed":
+        for observed in world.execute(world.node, ACTION | {"pour_position": (-0.2, 0.33)}, {"skill": "tip"}).values():
+            known |= observed
+    said = pouring.bound(
+        *(ca.DM(known[label]) for label in ("flow_centre", "flow_variance", "target_change")),
+        0.0,
+        known["receiver_size"],
     )
+    assert 0.0 <= known["released_change"] - float(said["stop_amount"]) < 0.1
 
 
 def test_rewards_of_moves_are_those_of_the_distances():
@@ -337,8 +378,11 @@ FIGURE_8 = {
     "at_receiver": ["at_pour"],
     "at_pour": ["ready"],
     "ready": ["tipped", "shaken"],
-    "tipped": ["landed"],
-    "shaken": ["landed"],
+    "tipped": ["tip_bounded"],
+    "shaken": ["shake_bounded"],
+    "tip_bounded": ["released"],
+    "shake_bounded": ["released"],
+    "released": ["landed"],
     "landed": ["poured"],
     "poured": [],
 }
@@ -353,7 +397,7 @@ def ways(tree):
     return found
 
 
-def test_the_graph_is_that_of_figure_8_with_a_node_where_the_flow_has_landed():
+def test_the_graph_is_that_of_figure_8_with_nodes_for_what_follows_from_the_flow():
     tree = sg.unroll(plain_graph())
     assert ways(tree) == FIGURE_8
     later = [node for node in FIGURE_8 if node not in ("start", "grasped", "receiver_moved")]
@@ -370,10 +414,13 @@ def test_the_graph_is_that_of_figure_8_with_a_node_where_the_flow_has_landed():
 
 
 def test_both_skills_share_one_model_of_amounts():
-    tip, shake, shared = pouring.flow_network("tip"), pouring.flow_network("shake"), pouring.amount_network()
-    graph = pouring.graph(tip, shake, shared)
+    flow, release, shared = pouring.networks()
+    graph = pouring.graph(flow, release, shared)
     (ready,) = (group for group in graph.groups["ready"] if group.kind == "choose")
-    assert {b.label: b.model.learner for b in ready.branches} == {"tip": tip, "shake": shake}
+    assert {b.label: b.model.learner for b in ready.branches} == flow
+    for skill in SKILLS:
+        ((branch,),) = (group.branches for group in graph.groups[f"{skill}_bounded"])
+        assert branch.model.learner is release[skill]
     ((branch,),) = (group.branches for group in graph.groups["landed"])
     assert branch.model.learner is shared
 
@@ -381,6 +428,8 @@ def test_both_skills_share_one_model_of_amounts():
 def test_flows_of_another_skill_are_refused():
     with pytest.raises(ValueError, match=r"skill is 'stir'; choose from \['tip', 'shake'\]"):
         pouring.flow_network("stir")
+    with pytest.raises(ValueError, match=r"skill is 'stir'; choose from \['tip', 'shake'\]"):
+        pouring.release_network("stir")
 
 
 def test_networks_are_named_and_take_options():

@@ -114,8 +114,7 @@ BEST = "best of tries"
 @functools.cache
 def task() -> tuple[sg.Graph, ModelNumbers]:
     """The graph, whose networks nobody asks here, and what evaluates its rewards."""
-    networks = pouring.flow_network("tip"), pouring.flow_network("shake"), pouring.amount_network()
-    return pouring.graph(*networks), ModelNumbers()
+    return pouring.graph(*pouring.networks()), ModelNumbers()
 
 
 def episode(

@@ -35,7 +35,7 @@ RESULTS = FOLDER / "results.csv"
 TARGET = 0.3
 BONUS, BONUS_EPISODES = 10.0, 10  # the paper's reward shaping: for the favoured skill, in the first episodes of a stage
 LAST = 20  # episodes of a run that count as "after learning"
-SEEDS = 100  # of run 0, the next ones count from there: lower seeds served to find out what works
+SEEDS = 400  # of run 0, the next ones count from there: lower seeds served to find out what works
 FRESH = 10**6  # seeds of situations that no run meets: those of runs are spread over 32 bits
 
 SETUPS = {  # arguments of PouringWorld
@@ -99,10 +99,10 @@ class Condition:
         return replace(self, episodes=min(episodes, self.episodes), after=after)
 
 
-FEW = Exploration(selections=0.0, actions=0.5, noise=0.1, episodes=20)
-MANY = Exploration(selections=0.0, actions=0.5, noise=0.1, episodes=48)
-BOTH_SKILLS = Exploration(selections=1.0, actions=1.0, noise=0.1, episodes=48)
-BOTH_SKILLS_VARIED = Exploration(selections=1.0, actions=1.0, noise=0.1, episodes=120)
+FEW = Exploration(selections=0.0, episodes=20, **pouring.EXPLORATION)
+MANY = Exploration(selections=0.0, episodes=60, **pouring.EXPLORATION)
+BOTH_SKILLS = Exploration(selections=1.0, episodes=60, **pouring.EXPLORATION)
+BOTH_SKILLS_VARIED = Exploration(selections=1.0, episodes=120, **pouring.EXPLORATION)
 
 PT0_SETUP1 = Condition("setup1", "PT0-Rnone", 50, FEW)
 PT1_SETUP2 = Condition("setup2", "PT1-Rnone", 50, FEW, after=PT0_SETUP1)
@@ -167,10 +167,8 @@ class Run:
 
     def loop(self) -> OnlineLoop:
         """Return the loop in its folder; the graph has a bonus in all conditions, so that runs can build on others."""
-        size = {"hidden": self.condition.hidden}
-        flows = [pouring.flow_network(skill, **size) for skill in pouring.SKILLS]
         return OnlineLoop(
-            pouring.graph(*flows, pouring.amount_network(**size), shaped=True),
+            pouring.graph(*pouring.networks(hidden=self.condition.hidden), shaped=True),
             self.condition.stages,
             self.folder,
             **pouring.TRIALS | {"attempts": self.condition.attempts},

@@ -35,6 +35,8 @@ def test_an_episode_keeps_every_step():
         "at_pour",
         "ready",
         "shaken",
+        "shake_bounded",
+        "released",
         "landed",
         "poured",
     ]
