@@ -42,7 +42,8 @@ def second_order(y: Any, x: Mapping[str, Any], covariance: Mapping[str, Any]) ->
     for k in range(y.numel()):
         terms = [ca.trace(ca.mtimes(ca.hessian(y[k], x[label])[0], sigma)) for label, sigma in covariance.items()]
         curvature.append(sum(terms, type(y)(1, 1)) / 2)
-    return y + ca.vertcat(*curvature), linear(y, x, covariance)[1]
+    # CasADi adds zeros to zeros without an element being left.
+    return ca.densify(y + ca.vertcat(*curvature)), linear(y, x, covariance)[1]
 
 
 def unscented(y: Any, x: Mapping[str, Any], covariance: Mapping[str, Any]) -> Moments:

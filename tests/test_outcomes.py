@@ -142,3 +142,16 @@ def test_a_node_that_cannot_be_reached_is_not_noted():
     objective = objective_of(g)
     assert objective.outcomes({"p": 1.0}).notes() == []
     assert len(objective.outcomes({"p": 0.5}).notes()) == 1
+
+
+@pytest.mark.parametrize("propagation", ["mean", "linear", "second-order", "unscented", "quadrature"])
+@pytest.mark.parametrize("spread", [0.0, 0.04])
+def test_what_is_zero_everywhere_is_a_number(propagation, spread):
+    g = sg.Graph({"u": sg.Action(low=-1, high=1), "x": sg.State(), "y": sg.State(2)}, "aim")
+    g.edge("aim", "shot", sg.Model(lambda x: {"y": ca.vertcat(0 * x, 0 * x)}, propagation=propagation))
+    g.reward("shot", sg.Model(lambda y: 0 * y[0], propagation=propagation))
+    g.reward("shot", lambda u: -(u**2))
+    plan = sg.solve(objective_of(g), {"x": sg.Gaussian(3.0, spread)}, progress=False)
+    assert plan.value == pytest.approx(0.0, abs=1e-12)
+    assert plan.nodes[1].reward == plan.value
+    assert_close(plan.nodes[1].states["y"].mean, [0.0, 0.0])
