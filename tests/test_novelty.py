@@ -1,6 +1,7 @@
 """Which choice is known least in a situation."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from online_worlds import kick_graph
@@ -43,12 +44,37 @@ def test_where_all_situations_are_the_same_choices_take_turns():
     assert len(least([0.3], *tries)) == 2
 
 
-def test_elements_that_are_not_known_do_not_count():
-    pairs = ([np.nan, 0.0], "tip"), ([3.0, 1.0], "shake")
-    assert least([100.0, 0.9], *pairs) == ["shake"]
-    assert least([3.0, 0.9], *pairs) == ["tip"]
+def test_an_element_that_a_try_does_not_know_counts_as_two_independent_draws():
+    # The first elements known are 0, 2, 0, 2, so that their deviation is 1; the second is the same everywhere.
+    known = [([2.0 * (k % 2), 7.0], "tip") for k in range(4)]
+    assert least([1.4, 7.0], *known, ([np.nan, 7.0], "shake")) == ["shake"]  # 0.6² < 2
+    assert least([3.4, 7.0], *known, ([np.nan, 7.0], "shake")) == ["shake"]  # 1.4² < 2
+    assert least([3.5, 7.0], *known, ([np.nan, 7.0], "shake")) == ["tip"]  # 1.5² > 2
+
+
+def test_an_element_that_is_not_known_here_says_nothing():
+    pairs = ([np.nan, 0.0], "tip"), ([3.0, 1.0], "shake"), ([9.0, 1.0], "shake")
     assert least([np.nan, 0.9], *pairs) == ["tip"]
-    assert least([np.nan, np.nan], *pairs) == ["tip", "shake"]
+    assert least([np.nan, 0.1], *pairs) == ["shake"]
+    assert least([np.nan, np.nan], *pairs) == ["tip"]  # made less often
+
+
+def test_what_varies_by_rounding_alone_says_nothing():
+    same = np.array([0.3, 0.1 + 0.2, 0.3])
+    assert same.std() > 0.0
+    pairs = ([same[0], 0.0], "tip"), ([same[1], 1.0], "shake"), ([same[2], 5.0], "shake")
+    assert least([0.3, 0.1], *pairs) == ["shake"]
+    assert least([0.3, 0.9], *pairs) == ["tip"]
+    assert least([0.1 + 0.2, 0.1], *pairs) == ["shake"]
+    assert least([0.1 + 0.2, 0.9], *pairs) == ["tip"]
+
+
+@pytest.mark.parametrize("size", [1e-200, 1e200])
+def test_sizes_do_not_matter(size):
+    pairs = ([-size, 0.0], "tip"), ([size, 0.0], "shake")
+    assert least([0.5 * size, 0.0], *pairs) == ["tip"]
+    assert least([-0.5 * size, 0.0], *pairs) == ["shake"]
+    assert least([-0.5 * size, 1e200], *pairs) == ["shake"]
 
 
 numbers = st.integers(-8, 8).map(float)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
@@ -11,6 +12,7 @@ from symgraph.learned.knowledge import Known, column_of
 from symgraph.slots import Array
 
 Try = tuple[Array, Mapping[str, str]]  # a situation (n,), NaN where it is not known, and {selection: choice} made in it
+SMALLEST_SPREAD = 1e-9  # standard deviation over the largest number, up to which it is rounding error
 
 
 def situation_of(graph: Graph, labels: Iterable[str], known: Known, at_start: Known) -> Array:
@@ -34,7 +36,9 @@ def least_known(selection: str, choices: Sequence[str], situation: Array, tries:
     """Return the choices whose nearest try lies farthest from a situation; of equals, those made least often.
 
     Nearness is the distance of the situations, each element in standard deviations over all tries. A skill that has
-    been tried a hundred times with paste is still unknown for water.
+    been tried a hundred times with paste is still unknown for water. An element that a try does not know counts as two
+    independent draws would be expected to, 2 squared deviations; one that is not known in the situation, or that does
+    not vary, says nothing.
 
     Args:
         selection: the selection.
@@ -42,17 +46,16 @@ def least_known(selection: str, choices: Sequence[str], situation: Array, tries:
         situation: (n,), see `situation_of`.
         tries: so far.
     """
-    made = [choices_made.get(selection) for _, choices_made in tries]
     if not tries:
         return list(choices)
+    made = [choices_made.get(selection) for _, choices_made in tries]
     seen = np.array([where for where, _ in tries])
-    offsets = seen - situation
-    known = ~np.isnan(offsets)
-    offsets[~known] = 0.0
-    count = np.maximum(known.sum(axis=0), 1)
-    mean = np.where(known, seen, 0.0).sum(axis=0) / count
-    sd = np.sqrt((np.where(known, seen - mean, 0.0) ** 2).sum(axis=0) / count)
-    distances = np.sqrt(((offsets / np.where(sd > 0.0, sd, 1.0)) ** 2).sum(axis=1))
+    largest = np.fmax.reduce(np.abs([*seen, situation]))  # passes over NaN
+    unit = np.where(largest > 0.0, largest, 1.0)  # in which no square overflows
+    sd = unit * np.ma.masked_invalid(seen / unit).std(axis=0).filled(0.0)
+    tells = (sd > SMALLEST_SPREAD * unit) & ~np.isnan(situation)
+    offsets = (seen[:, tells] - situation[tells]) / sd[tells]
+    distances = np.hypot.reduce(np.where(np.isnan(offsets), math.sqrt(2.0), offsets), axis=1)
 
     def unknown(choice: str) -> tuple[float, int]:
         at = [i for i, one in enumerate(made) if one == choice]
