@@ -11,6 +11,7 @@ from symgraph.learned import Exploration, OnlineLoop, Stage, StochasticNetwork
 
 QUICK = sg.Lbfgs(starts=4, iterations=50)
 NOTHING = Exploration(episodes=0)
+ALWAYS = 1e9  # episodes after which nothing is explored: the same share in each of a few hundred
 
 
 def kick(skill, u, s):
@@ -109,6 +110,44 @@ def kick_graph(near=None, far=None, reward=lambda y: -((y - 1.0) ** 2), **more):
     for node in ("near_end", "far_end"):
         graph.reward(node, reward)
     return graph
+
+
+def carry_graph(reward=lambda y: -((y - 0.5) ** 2)):
+    """Take a thing with a hand, move it, throw it; what lies behind a node has no part in what follows it."""
+    slots = {"grip": sg.Action(low=0.0, high=1.0), "throw": sg.Action(2, low=-1.0, high=1.0)}
+    slots |= {"hand": sg.Selection(["left", "right"]), "way": sg.Selection(["high", "low"])}
+    slots |= {"weight": sg.State(), "held": sg.State(), "y": sg.State()}
+    graph = sg.Graph(slots, start="seen")
+
+    def hold(grip):
+        return {"held": grip}
+
+    graph.choose("seen", "hand", {"left": ("taken", hold), "right": ("taken", hold)})
+    graph.edge("taken", "lifted")
+    fly = Spy({"throw": 2, "weight": 1}, {"y": 1}, "fly", [1.0, 1.0, -1.0])
+    graph.choose("lifted", "way", {"high": ("thrown", fly), "low": ("rolled", None)})
+    graph.reward("taken", lambda held, hand: -((held - 0.7) ** 2) - 0.5 * hand[0])
+    graph.reward("thrown", reward)
+    graph.reward("rolled", lambda weight: -1.0 - weight**2)
+    return graph
+
+
+def carrying(weight=0.5):
+    """The world of `carry_graph`, in which a thing turns out to be lighter once it is lifted."""
+    return Scripted(
+        {"weight": weight},
+        {
+            "seen": lambda actions, selections, world: {"taken": {"held": actions["grip"]}},
+            "taken": {"lifted": {"weight": -0.5}},
+            "lifted": lambda actions, selections, world: (
+                {"thrown": {"y": float(actions["throw"].sum()) + 0.5}}
+                if selections["way"] == "high"
+                else {"rolled": {}}
+            ),
+            "thrown": {"taken": {"weight": 0.25}},
+            "rolled": {"taken": {"weight": 0.25}},
+        },
+    )
 
 
 def networks(hidden=(16,), **options):

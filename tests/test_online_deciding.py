@@ -5,51 +5,11 @@ import math
 import casadi as ca
 import numpy as np
 import pytest
-from online_worlds import NOTHING, Scripted, Spy, kick_graph, loop
+from online_worlds import ALWAYS, NOTHING, Scripted, carry_graph, carrying, kick_graph, loop
 from small_tasks import refuses
 
 import symgraph as sg
 from symgraph.learned import Exploration, OnlineLoop, Stage
-
-ALWAYS = 1e9  # episodes after which nothing is explored: the same share in each of a few hundred
-
-
-def carry_graph(reward=lambda y: -((y - 0.5) ** 2)):
-    """Take a thing with a hand, move it, throw it; what lies behind a node has no part in what follows it."""
-    slots = {"grip": sg.Action(low=0.0, high=1.0), "throw": sg.Action(2, low=-1.0, high=1.0)}
-    slots |= {"hand": sg.Selection(["left", "right"]), "way": sg.Selection(["high", "low"])}
-    slots |= {"weight": sg.State(), "held": sg.State(), "y": sg.State()}
-    graph = sg.Graph(slots, start="seen")
-
-    def hold(grip):
-        return {"held": grip}
-
-    graph.choose("seen", "hand", {"left": ("taken", hold), "right": ("taken", hold)})
-    graph.edge("taken", "lifted")
-    fly = Spy({"throw": 2, "weight": 1}, {"y": 1}, "fly", [1.0, 1.0, -1.0])
-    graph.choose("lifted", "way", {"high": ("thrown", fly), "low": ("rolled", None)})
-    graph.reward("taken", lambda held, hand: -((held - 0.7) ** 2) - 0.5 * hand[0])
-    graph.reward("thrown", reward)
-    graph.reward("rolled", lambda weight: -1.0 - weight**2)
-    return graph
-
-
-def carrying(weight=0.5):
-    """The world of `carry_graph`, in which a thing turns out to be lighter once it is lifted."""
-    return Scripted(
-        {"weight": weight},
-        {
-            "seen": lambda actions, selections, world: {"taken": {"held": actions["grip"]}},
-            "taken": {"lifted": {"weight": -0.5}},
-            "lifted": lambda actions, selections, world: (
-                {"thrown": {"y": float(actions["throw"].sum()) + 0.5}}
-                if selections["way"] == "high"
-                else {"rolled": {}}
-            ),
-            "thrown": {"taken": {"weight": 0.25}},
-            "rolled": {"taken": {"weight": 0.25}},
-        },
-    )
 
 
 def test_plans_are_made_at_decision_nodes_only_and_what_lies_behind_is_kept(tmp_path):
@@ -168,56 +128,6 @@ def test_exploration_draws_as_often_as_it_says(tmp_path):
     for skill, action, text in zip(skills, actions, explored, strict=True):
         if "actions" not in text:
             assert action == pytest.approx(best[skill], abs=1e-3)
-
-
-def test_each_choice_is_drawn_in_each_kind_of_situation(tmp_path):
-    """Plans are always "far": what is drawn makes "near" known where s is small and where it is large."""
-    places = {}
-
-    def start(seed):
-        return {"s": 0.2 + 10.0 * (seed % 2) + 1e-3 * (seed % 7)}
-
-    def aim(actions, selections, world):
-        place = world.seeds[-1] % 2
-        places.setdefault(place, []).append(selections["skill"])
-        return {f"{selections['skill']}_end": {"y": 0.5}}
-
-    explore = Exploration(selections=0.5, actions=0.0, noise=0.0, episodes=ALWAYS)
-    spies = Spy({"u": 1, "s": 1}, {"y": 1}, "near"), Spy({"u": 1, "s": 1}, {"y": 1}, "far")
-    with loop(tmp_path, kick_graph(*spies), Scripted(start, {"aim": aim}), 60, explore) as one:
-        drawn = [report.explored != "" for report in one]
-    assert is_share(sum(drawn), 60, 0.5)
-    for made in places.values():
-        assert 0.2 <= made.count("near") / len(made) <= 0.8
-
-
-def test_choices_that_fail_count_as_made(tmp_path):
-    def aim(actions, selections, world):
-        if selections["skill"] == "near":
-            error = RuntimeError("stuck")
-            error.observed = {"y": 0.0}
-            raise error
-        return {"far_end": {"y": 0.5}}
-
-    explore = Exploration(selections=1.0, actions=0.0, noise=0.0, episodes=ALWAYS)
-    with loop(tmp_path, kick_graph(), Scripted({"s": 0.2}, {"aim": aim}), 20, explore) as one:
-        skills = [report.selections["skill"] for report in one]
-    assert skills.count("near") == skills.count("far") == 10
-    assert all(set(pair) == {"near", "far"} for pair in zip(skills[::2], skills[1::2], strict=True))
-
-
-def test_each_attempt_of_an_episode_counts_as_made(tmp_path):
-    explore = Exploration(selections=1.0, actions=0.0, noise=0.0, episodes=ALWAYS)
-    with loop(
-        tmp_path, carry_graph(), carrying(), 12, explore, decisions=["lifted"], again="thrown", attempts=4
-    ) as one:
-        list(one)
-        made = {"high": 0, "low": 0}
-        for number in range(12):
-            for plan in one.store.plans(number).values():
-                way = plan["selections"]["way"]
-                made[way] += 1
-    assert abs(made["high"] - made["low"]) <= 2
 
 
 def test_noise_has_the_spread_it_says_and_stays_in_bounds(tmp_path):

@@ -172,6 +172,7 @@ def test_ctrl_c_just_after_something_was_done_changes_nothing(tmp_path, moment, 
             told(one.store),
             [(lesson.model.samples, np.array(lesson.x).tolist(), lesson.y) for lesson in lessons],
             starts,
+            [(where.tolist(), made) for where, made in one._past.tries],
         )
 
     with made("whole") as one:

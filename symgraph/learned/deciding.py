@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from symgraph.binding import BoundModel
 from symgraph.graph import Graph
 from symgraph.learned.execution import Decision
 from symgraph.learned.knowledge import Knowledge
@@ -59,7 +60,7 @@ class Decider:
         number: of the episode.
         explore: how much is tried in this episode.
         starts: decisions of other episodes, to start searches from.
-        tries: where plans of other episodes chose what; what is drawn is what is known least, see `least_known`.
+        tries: of other episodes; what is drawn is what is known least, see `least_known`.
         recalled: {step: notes} of plans that were made before.
         note: called with the step and the notes of every new plan.
 
@@ -123,6 +124,7 @@ class Decider:
             self.plans[visit.step] = notes
             self._take_over(notes)
             self.seconds += time.perf_counter() - begin
+        self._tries += _tries_at(self._planning, self._knowledge, visit, self.decision[1])
         return self.decision
 
     def recall(self) -> None:
@@ -143,9 +145,8 @@ class Decider:
         self.attempts += 1
         draws_selections, draws_actions = rng.random(2) < (self._explore.selections, self._explore.actions)
         situation = _situation(self._planning, self._knowledge, visit.step)
-        tries = [*self._tries, *tries_of(self._planning, self._knowledge, self.plans)]
         selections = {
-            label: str(rng.choice(least_known(label, slot.choices, situation, tries)))
+            label: str(rng.choice(least_known(label, slot.choices, situation, self._tries)))
             for label, slot in graph.selections().items()
         }
         actions = {label: rng.uniform(slot.lower, slot.upper) for label, slot in graph.actions().items()}
@@ -200,9 +201,23 @@ class Decider:
         return float(column[0]) if slot.size == 1 else column
 
 
-def tries_of(planning: Planning, knowledge: Knowledge, plans: Mapping[int, Notes]) -> list[Try]:
-    """Return where {step: notes} of an episode's plans chose what."""
-    return [(_situation(planning, knowledge, step), notes["selections"]) for step, notes in plans.items()]
+def tries_of(planning: Planning, knowledge: Knowledge, visits: Sequence[Visit], info: Mapping[str, Any]) -> list[Try]:
+    """Return the choices that were executed in an episode, from its visits and what was noted when it ended."""
+    left = {visit.parent: visit.selections for visit in visits if visit.parent is not None}
+    if "failed_at" in info:
+        left[info["failed_at"]] = info["selections"]
+    return [one for step, made in left.items() for one in _tries_at(planning, knowledge, visits[step], made)]
+
+
+def _tries_at(planning: Planning, knowledge: Knowledge, visit: Visit, selections: Mapping[str, str]) -> list[Try]:
+    """Return the try that leaving a visit's node is; none where neither the way nor a model depends on a selection."""
+    used: set[str | None] = set()
+    for group in planning.graph.groups.get(visit.node, ()):
+        if group.kind != "reward":
+            models = [group.probability, *(branch.model for branch in group.branches)]
+            used.update([group.selection], *(model.reads for model in models if isinstance(model, BoundModel)))
+    made = {label: choice for label, choice in selections.items() if label in used}
+    return [(_situation(planning, knowledge, visit.step), made)] if made else []
 
 
 def _situation(planning: Planning, knowledge: Knowledge, step: int) -> Array:

@@ -23,8 +23,9 @@ Decision = tuple[dict[str, Any], dict[str, str]]  # actions, selections
 class WorldFailed(Exception):
     """A world failed on the way, and said what was observed until then."""
 
-    def __init__(self, node: str, error: Exception, observed: Mapping[str, Any]) -> None:
-        super().__init__(f"{type(error).__name__} at node {node!r}: {error}")
+    def __init__(self, visit: Visit, error: Exception, observed: Mapping[str, Any]) -> None:
+        super().__init__(f"{type(error).__name__} at node {visit.node!r}: {error}")
+        self.step = visit.step
         self.observed = dict(observed)
 
 
@@ -123,7 +124,7 @@ class Execution:
                 raise Diverged(
                     f"the world failed where it did not before, step {visit.step}: {type(error).__name__}: {error}"
                 ) from error
-            raise WorldFailed(visit.node, error, observed) from error
+            raise WorldFailed(visit, error, observed) from error
         self._check_reached(visit, reached)
         return reached  # type: ignore[no-any-return]  # it has just been checked
 

@@ -230,7 +230,7 @@ class OnlineLoop:
             fitting += time.perf_counter() - begin
 
         status, reason, visits = "done", "", execution.visits
-        observed: dict[str, Any] = {}
+        failed: dict[str, Any] = {}
         try:
             execution.run(seed, stage.given_at(within), decider.decide, reached, decider.goes_on)
         except Diverged as error:
@@ -241,17 +241,16 @@ class OnlineLoop:
             self._lessons.rewind(self._taken[1])
             self._lessons.fit(self._lessons.take(past, past, knowledge))
         except WorldFailed as failure:
-            status, reason, observed = "failed", str(failure), failure.observed
-            knowledge.latest |= observed
+            status, reason = "failed", str(failure)
+            failed = {"observed": failure.observed, "failed_at": failure.step}
+            knowledge.latest |= failure.observed
         returns = returns_of(visits, self._planning.again)
         report = _report(
             number, stage.name, seed, status, reason, returns, knowledge, decider, execution.seconds, fitting
         )
-        info = {name: getattr(report, name) for name in ("returns", "selections", "value", "explored")}
-        if status == "failed":
-            info["observed"] = observed
+        info = {name: getattr(report, name) for name in ("returns", "selections", "value", "explored")} | failed
         self.store.end(number, status, total=report.total, reason=reason, seconds=report.seconds, info=info)
-        tries = tries_of(self._planning, knowledge, decider.plans)
+        tries = tries_of(self._planning, knowledge, visits, info)
         self._past.add(stage.name, status, report.total, decider.plans, tries)
         self._taken = number + 1, self._lessons.counts()
         return report
@@ -289,7 +288,7 @@ class OnlineLoop:
             knowledge.take_over(visits)
             self._lessons.take(visits, visits, knowledge)
             plans = self.store.plans(episode.number)
-            tries = tries_of(self._planning, knowledge, plans)
+            tries = tries_of(self._planning, knowledge, visits, episode.info)
             self._past.add(episode.setup, episode.status, episode.total, plans, tries)
         self._taken = number, self._lessons.counts()
 

@@ -23,7 +23,7 @@ class PastEpisode:
         setup: the name of its stage.
         total: its return; None if it ended early, and may not have come to what it would have been punished for.
         decision: the last one, {label: value or choice}.
-        tries: situation and selections of every plan.
+        tries: the choices that were executed.
     """
 
     setup: str
@@ -47,13 +47,13 @@ class Past:
 
     @property
     def tries(self) -> list[Try]:
-        """Situation and selections of every plan of every episode."""
+        """The choices that were executed in every episode."""
         return [one for episode in self.episodes for one in episode.tries]
 
     def add(
         self, setup: str, status: str, total: float | None, plans: Mapping[int, Notes], tries: Sequence[Try]
     ) -> None:
-        """Remember an episode, given {step: notes} of its plans, and where they were made."""
+        """Remember an episode, given {step: notes} of its plans, and its tries."""
         last: Notes = plans[max(plans)] if plans else {"actions": {}, "selections": {}}
         counts = status == "done" and bool(plans) and total is not None and math.isfinite(total)
         decision = {**last["actions"], **last["selections"]}
