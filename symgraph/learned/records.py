@@ -66,7 +66,7 @@ class Episode:
         setup: the name of the situation it was run in.
         seed: that the world was reset with.
         status: "running", "done", "failed" or "interrupted".
-        reason: why it failed, else empty.
+        reason: why it failed or was interrupted, else empty.
         total: the return, the sum of its rewards; None while it runs.
         seconds: {what was done: how long it took} [s]; empty while it runs.
         info: whatever else was noted when it ended.

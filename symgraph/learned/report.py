@@ -18,7 +18,7 @@ class EpisodeReport:
         setup: the name of its stage.
         seed: that the world was reset with.
         status: "done", "failed" or "interrupted".
-        reason: why it failed, else empty.
+        reason: why it failed or was interrupted, else empty.
         returns: of each attempt, from one going through the graph to the next, the sum of its rewards.
         actions: {label: value} decided last.
         selections: {label: choice} decided last.

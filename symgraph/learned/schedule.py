@@ -45,11 +45,12 @@ class Exploration:
     Beside it, `solve` explores by itself while a model has too few samples.
 
     Args:
-        selections: probability that an attempt's selections are drawn instead of planned, in the first episode: the
-            choice whose nearest try lies farthest from the situation, as learned models see it.
+        selections: probability that an attempt's selections are drawn instead of planned, in the first episode. What is
+            drawn is the choice known least: its nearest try, of any stage, lies farthest from the situation. Situations
+            are told apart by those states that learned models read and that are known where an episode starts.
         actions: probability that its actions are drawn from their whole range, in the first episode.
-        noise: standard deviation of what is otherwise added to each action, as a share of its range, in the first
-            episode.
+        noise: standard deviation of what is added to actions that are not drawn, as a share of their range, in the
+            first episode.
         episodes: after how many nothing is tried any more.
 
     Raises:
