@@ -19,7 +19,7 @@ GRASP_RANGE = (0.05, 0.45)  # height of the grasp on the source for the ratios 0
 POUR_LOW = (-0.35, 0.32)  # of the pouring position: x from the receiver's centre, z above the floor [length]
 POUR_HIGH = (0.0, 0.55)
 FULL = 0.55  # amount in the source before the first attempt
-STOP_SPILLED = 0.055  # amount that is spilled when a skill gives up: ten spheres
+STOP_SPILLED = 10 * 0.0055  # amount in ten spheres, at whose spilling a skill ends, in units of `released`
 LEAST_SHARE = 1e-3  # of a flow, for divisions by it
 LANDING_SPREAD = 0.03  # standard deviation that is added to that of a flow: spheres have a size, and bounce [length]
 
@@ -205,8 +205,7 @@ SKILL_ACTIONS: dict[str, dict[str, int]] = {
 # Each trial is planned anew when the source is at the receiver. After "poured" the world may lead there again: until
 # the target is reached, or the source is empty, or it has tried often enough.
 TRIALS = {"decisions": ("at_receiver",), "again": "poured", "attempts": 4}
-# Most is learned near the plans, if what is tried reaches far enough beside them. Returns above -1 in the last 20 of 80
-# episodes, 8 runs: 90% with these, 81% with 0.5 and 0.15 as with 1.0 and 0.1; 76% with 0.0 and 0.2 (4 runs).
+# Most is learned near the plans, see docs/reproduction/pouring.
 EXPLORATION = {"actions": 0.15, "noise": 0.2}
 # Single accidents spill 30 to 70 spheres; learned as they are, nothing else would count. [amount]
 LIMITS = {"spilled_change": (0.0, 1.0)}

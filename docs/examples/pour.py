@@ -52,9 +52,10 @@ EXPLORED = 60  # episodes in which it tries something beside its plans, less oft
 # The task and the loop
 # ---------------------
 # ``models/pouring.py`` holds the graph of the paper's figure 8: grasp, move to the receiver, move to the pouring
-# position, choose a skill, pour. How each skill makes spheres flow, and how a flow fills the receiver, is left to three
-# networks. The loop plans, pours, stores what happened, fits the networks whose edges ran, and goes on. If too little
-# was poured it tries again, up to four times in an episode.
+# position, choose a skill, pour. Five networks are left to be learned: for each skill one that tells where a flow comes
+# down and one that tells how much is released, and one for how much of that is poured and spilled. The loop plans,
+# pours, stores what happened, fits the networks whose edges ran, and goes on. If too little was poured it tries again,
+# up to four times in an episode.
 
 
 def loop_in(world, name, episodes, seed, folder):
