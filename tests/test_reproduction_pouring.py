@@ -222,3 +222,62 @@ def test_rows_that_were_half_written_are_dropped(tmp_path):
     assert read(path) == [{"a": "1", "b": "2"}]
     append(path, ("a", "b"), [{"a": 5, "b": 6}])
     assert path.read_text() == "a,b\n1,2\n5,6\n"
+
+
+def test_runs_that_were_begun_with_another_seed_are_refused(tmp_path, monkeypatch):
+    import learn
+    import setups
+
+    (condition,) = setups.chosen(["setup1/PT0-Rnone"])
+    run = setups.Run(condition, 0, tmp_path)
+    run.loop().close()
+    assert not run.finished
+    seed = setups.SEEDS
+    monkeypatch.setattr(setups, "SEEDS", seed + 1)
+    said = f"PT0-Rnone/0 was begun with seed {seed}, but SEEDS in setups.py makes it {seed + 1}; move that folder"
+    asked = [lambda: run.done, lambda: run.finished, lambda: run.ended, run.rows]
+    for ask in [*asked, lambda: learn.rebuild(tmp_path, tmp_path / "results.csv")]:
+        with pytest.raises(SystemExit, match=said):
+            ask()
+
+
+def test_rows_of_other_seeds_are_dropped(tmp_path, capsys):
+    """From the results of learning; the second stage of a run counts on from the first."""
+    import learn
+    from setups import COLUMNS, seed_of, write
+
+    path = tmp_path / "results.csv"
+    mine = [
+        row(seed_of(int(run), number), -1.0, setup=setup, condition=name, run=run, episode="0")
+        for setup, name, run, number in (("setup1", "PT0-Rnone", "1", 0), ("setup2", "PT1-Rnone", "0", 50))
+    ]
+    foreign = row(seed_of(2, 0), -1.0, setup="setup1", condition="PT0-Rnone", run="0", episode="0")
+    write(path, COLUMNS, [*mine, foreign])
+    learn.rebuild(tmp_path / "runs", path)
+    assert [(kept["condition"], kept["run"]) for kept in rows_of(path)] == [("PT0-Rnone", "1"), ("PT1-Rnone", "0")]
+    assert "setup1/PT0-Rnone, run 0: 1 rows of other seeds are dropped" in capsys.readouterr().out
+
+
+def test_policies_pour_anew_where_seeds_have_changed(tmp_path, monkeypatch, capsys):
+    import baselines
+    import setups
+
+    path, poured = tmp_path / "baselines.csv", []
+    monkeypatch.setattr(baselines, "work", lambda pour, jobs, processes, look: poured.append([*jobs]))
+
+    def main():
+        baselines.main(runs=1, fresh=1, tries=2, processes=1, results=path)
+        return [job.run for job in poured.pop()]
+
+    assert main().count("0") == 80
+    jobs = [
+        baselines.Job(setup, policy, run, situation, 2)
+        for setup, run, situation in (("general", "0", 60), ("general", "fresh", 0))
+        for policy in baselines.POLICIES
+    ]
+    rows = [{**dict(zip(baselines.COLUMNS, job.key, strict=False)), "seed": job.seed} for job in jobs]
+    setups.write(path, baselines.COLUMNS, rows)
+    assert (main().count("0"), len(rows_of(path))) == (76, 8)
+    monkeypatch.setattr(setups, "SEEDS", setups.SEEDS + 1)
+    assert (main().count("0"), len(rows_of(path))) == (80, 4)
+    assert "4 rows of other seeds are dropped" in capsys.readouterr().out

@@ -82,6 +82,11 @@ class Job:
         return self.setup, self.policy, self.run, str(self.situation)
 
 
+def job_of(row: Mapping[str, str]) -> Job:
+    """Return the job that a row came from, but for the number of tries."""
+    return Job(row["setup"], row["policy"], row["run"], int(row["situation"]), tries=0)
+
+
 def random_choice(job: Job, world: PouringWorld) -> tuple[str, Actions]:
     """Both skills in turn, with actions from their whole range."""
     rng = np.random.default_rng([job.seed, BALLOT])
@@ -204,9 +209,12 @@ def main(
     results: Annotated[Path, typer.Option(help="File of the episodes.")] = BASELINES,
 ) -> None:
     """Pour, where it has not been done already."""
-    rows = read(results)
+    found = read(results)
+    rows = [row for row in found if row["seed"] == str(job_of(row).seed)]
+    if len(rows) < len(found):
+        typer.echo(f"{len(found) - len(rows)} rows of other seeds are dropped")
     write(results, COLUMNS, rows)
-    done = {tuple(row[name] for name in COLUMNS[:4]) for row in rows}
+    done = {job_of(row).key for row in rows}
     where = [(setup, FRESH_RUN, k) for k in range(fresh) for setup in ("general", "varied")]
     last = range(EPISODES - LAST, EPISODES)
     where += [("general", str(run), k) for run in range(runs) for k in last]

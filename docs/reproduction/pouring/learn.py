@@ -66,7 +66,7 @@ def run(
 
 @app.command()
 def collect(folder: Folder = RUNS, results: Results = RESULTS) -> None:
-    """Make the file of the episodes anew; rows of runs that are not in the folder stay as they are."""
+    """Make the file of the episodes anew; rows of runs that are not in the folder stay, if their seeds are those."""
     rebuild(folder, results)
 
 
@@ -83,7 +83,7 @@ def go_on(job: Run) -> None:
 
 
 def rebuild(folder: Path, results: Path, begun: Collection[Run] = ()) -> None:
-    """Make the file of the episodes anew, without the old rows of runs that are begun."""
+    """Make the file of the episodes anew, without the old rows of runs that are begun, and of other seeds."""
     old = defaultdict(list)
     for row in read(results):
         old[row["setup"], row["condition"], int(row["run"])].append(row)
@@ -95,8 +95,17 @@ def rebuild(folder: Path, results: Path, begun: Collection[Run] = ()) -> None:
         places = Run(condition, 0, folder).folder.parent.glob("*")
         numbers |= {int(place.name) for place in places if place.name.isdecimal()}
         for number in sorted(numbers):
-            rows += Run(condition, number, folder).rows() or old[condition.setup, condition.name, number]
+            one = Run(condition, number, folder)
+            rows += one.rows() or fitting(one, old[condition.setup, condition.name, number])
     write(results, COLUMNS, rows)
+
+
+def fitting(one: Run, rows: list[dict[str, str]]) -> list[dict[str, str]]:
+    """Return those rows of a run that its seed led to; say what is left out."""
+    kept = [row for row in rows if int(row["seed"]) in one.seeds]
+    if len(kept) < len(rows):
+        typer.echo(f"{one.condition.key}, run {one.number}: {len(rows) - len(kept)} rows of other seeds are dropped")
+    return kept
 
 
 if __name__ == "__main__":

@@ -82,6 +82,11 @@ class Condition:
         return f"{self.setup}/{self.name}"
 
     @property
+    def total(self) -> int:
+        """How many episodes there are with those of the pre-training."""
+        return self.episodes + (0 if self.after is None else self.after.total)
+
+    @property
     def stages(self) -> list[Stage]:
         """What a loop goes through, beginning with the pre-training."""
         world = PouringWorld(**SETUPS[self.setup])
@@ -143,6 +148,16 @@ class Run:
         return self.runs / self.condition.setup / name / str(self.number)
 
     @property
+    def seed(self) -> int:
+        """Of the loop."""
+        return SEEDS + self.number
+
+    @property
+    def seeds(self) -> set[int]:
+        """Of the world in its episodes, with those of the pre-training."""
+        return {seed_of(self.number, number) for number in range(self.condition.total)}
+
+    @property
     def basis(self) -> Run | None:
         """The run that it goes on from."""
         return None if self.condition.after is None else replace(self, condition=self.condition.after)
@@ -174,7 +189,7 @@ class Run:
             **pouring.TRIALS | {"attempts": self.condition.attempts},
             limits=pouring.LIMITS,
             optimizer=sg.Lbfgs(starts=8, iterations=60),
-            seed=SEEDS + self.number,
+            seed=self.seed,
         )
 
     def rows(self, start: int = 0) -> list[dict[str, Any]]:
@@ -190,13 +205,23 @@ class Run:
 
     @contextlib.contextmanager
     def _store(self) -> Iterator[EpisodeStore | None]:
-        """Lend its store, which another process may be writing; None if nothing is there yet."""
+        """Lend its store, which another process may be writing; None if nothing is there yet.
+
+        Raises:
+            SystemExit: the run was begun with another seed.
+        """
         try:
             store = EpisodeStore(self.folder / "episodes.sqlite", read_only=True)
         except sg.StorageError:  # a damaged one the loop reports
             yield None
             return
         with store:
+            begun_with = store.settings.get("seed", self.seed)
+            if begun_with != self.seed:
+                raise SystemExit(
+                    f"{self.folder} was begun with seed {begun_with}, but SEEDS in setups.py makes it {self.seed}; "
+                    f"move that folder away, or give another --folder"
+                )
             yield store
 
     def _ended(self, store: EpisodeStore) -> list[Episode]:
@@ -291,7 +316,7 @@ def features_of(material: str) -> np.ndarray:
 
 
 def seed_of(run: int, number: int) -> int:
-    """Return the world's seed in an episode of a run without pre-training, as the loop draws it."""
+    """Return the world's seed in an episode of a run, counted with the pre-training, as the loop draws it."""
     return int(np.random.SeedSequence([SEEDS + run, number]).generate_state(1)[0])
 
 
