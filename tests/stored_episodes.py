@@ -22,8 +22,8 @@ def script(code, *arguments, **options):
     )
 
 
-def output_of(process):
-    out, _ = process.communicate(timeout=300)
+def output_of(process, timeout=300):
+    out, _ = process.communicate(timeout=timeout)  # [s]
     assert process.returncode == 0
     return out
 

@@ -14,6 +14,7 @@ from symgraph.learned import EpisodeStore, Exploration, StochasticNetwork
 
 EPISODES = 4
 KILLS = 9
+LONGEST = 900  # that all children together may take on a busy machine [s]
 
 # A loop of two attempts an episode; every child runs it in the same folder, and says into a pipe what it begins:
 # an edge, a plan, a fit. The parent kills it some time after the n-th beginning of a kind. Children are forks, because
@@ -113,9 +114,11 @@ print(json.dumps([whole, rounds]))
 """
 
 
+@pytest.mark.timeout(2 * LONGEST)
 def test_a_killed_loop_ends_as_one_that_was_not(tmp_path):
     sys.stdout.flush()
-    whole, rounds = json.loads(output_of(script(CODE, str(tmp_path), str(EPISODES), str(KILLS), str(ROOT / "tests"))))
+    process = script(CODE, str(tmp_path), str(EPISODES), str(KILLS), str(ROOT / "tests"))
+    whole, rounds = json.loads(output_of(process, LONGEST))
     killed_in = collections.Counter(events[-1][0] for events in rounds[:-1])
     print(f"killed after the beginning of: {dict(killed_in)}")
     assert len([events for events in rounds if events[-1] != ["over", EPISODES - 1]]) >= KILLS - 2
