@@ -253,6 +253,28 @@ def test_steps_are_as_many_as_asked_for_where_the_loss_goes_on_falling():
     assert trained(steps=57)[0].steps == 57
 
 
+@pytest.mark.parametrize("sizes", [(3, 2), (3, 5, 2), (3, 5, 4, 2)], ids=str)
+@pytest.mark.parametrize("loss", [losses.squares, losses.gaussian, losses.asymmetric, losses.cross_entropy])
+def test_gradients_by_hand_are_those_of_automatic_differentiation(sizes, loss):
+    rng = np.random.default_rng(2)
+    copies = random_copies(sizes, 4, rng)
+    pairs = zip(copies.weights, copies.biases, strict=True)
+    tensors = [torch.from_numpy(a).double().requires_grad_() for pair in pairs for a in pair]
+    x, targets, weight = (
+        torch.from_numpy(a) for a in (rng.normal(size=(7, 3)), rng.random((7, 2)), rng.random((4, 7)))
+    )
+    hidden = x.expand(4, -1, -1)
+    for i in range(0, len(tensors), 2):
+        hidden = hidden @ tensors[i] + tensors[i + 1]
+        hidden = hidden.relu() if i < len(tensors) - 2 else hidden
+    expected = torch.autograd.grad((loss(hidden, targets) * weight).sum(), tensors)
+    slopes = [torch.empty_like(tensor) for tensor in tensors]
+    with torch.no_grad():
+        training._gradient(tensors, slopes, x, targets, weight, loss)
+    for mine, theirs in zip(slopes, expected, strict=True):
+        assert_close(mine.numpy(), theirs.numpy(), 1e-13)
+
+
 def test_the_start_is_left_as_it_was():
     _, (_, _, _, copies) = trained()
     assert (copies.weights[-1] == 0).all()

@@ -135,6 +135,8 @@ def train(
 ) -> Training:
     """Minimise a loss by Adam with a falling rate, all copies in one step, and keep the best weights on the way.
 
+    Gradients go back through the layers by hand: with few samples an automatic one costs several times the sums.
+
     Args:
         copies: where to start; copy 1 + k leaves out fold k.
         x: (N, n) whitened inputs.
@@ -150,34 +152,27 @@ def train(
     torch = import_torch()
     n, held_out_copies = len(x), copies.count - 1
     inputs, wanted = (torch.from_numpy(np.asarray(a, dtype=np.float32)) for a in (x, targets))
-    learns = np.ones((copies.count, n), dtype=np.float32)
+    learning = torch.ones((copies.count, n))
     for k in range(held_out_copies):
-        learns[1 + k, folds == k] = 0.0
-    learning = torch.from_numpy(learns)
+        learning[1 + k, torch.from_numpy(folds == k)] = 0.0
     judged = np.flatnonzero(folds < held_out_copies)
     if len(judged) > MOST_SCORED:
         judged = np.sort(rng.choice(judged, MOST_SCORED, replace=False))
-    judged_by = [torch.from_numpy(judged[folds[judged] == k]) for k in range(held_out_copies)]
+    scored = _Scored([judged[folds[judged] == k] for k in range(held_out_copies)], inputs, wanted)
 
-    tensors = [torch.from_numpy(a.copy()) for pair in zip(copies.weights, copies.biases, strict=True) for a in pair]
-    average = [tensor.clone() for tensor in tensors]
-    best = [tensor.clone() for tensor in tensors]
-
-    def held_out_loss() -> float:
-        total = 0.0
-        with torch.no_grad():
-            for k, rows in enumerate(judged_by):
-                one = [tensor[1 + k : 2 + k] for tensor in average]
-                total += float(loss(_forward(one, inputs[rows]), wanted[rows]).sum())
-        return total / max(1, len(judged))
-
+    shapes = [a.shape for pair in zip(copies.weights, copies.biases, strict=True) for a in pair]
+    # All weights in one vector: one call of Adam moves them, one average follows.
+    flat = torch.cat(
+        [torch.from_numpy(a).flatten() for pair in zip(copies.weights, copies.biases, strict=True) for a in pair]
+    )
+    average, best, slope = flat.clone(), flat.clone(), torch.zeros_like(flat)
+    tensors, averages, slopes = (_views(one, shapes) for one in (flat, average, slope))
     batch = min(n, max(32, COLUMNS // copies.count))
     order, at = rng.permutation(n), 0
-    with _one_thread():
-        least, least_step, made = held_out_loss(), 0, 0
-        for tensor in tensors:
-            tensor.requires_grad_(True)
-        optimizer = torch.optim.Adam(tensors, lr=LEARNING_RATE, betas=(0.9, 0.99), fused=True)
+    with _one_thread(), torch.no_grad():
+        least, least_step, made = scored.loss(averages, loss), 0, 0
+        flat.grad = slope
+        optimizer = torch.optim.Adam([flat], lr=LEARNING_RATE, betas=(0.9, 0.99), fused=True)
         for step in range(steps):
             if at + batch > n:
                 order, at = rng.permutation(n), 0
@@ -187,41 +182,89 @@ def train(
             rate = min(1.0, (step + 1) / 10) * 0.5 * (1 + math.cos(math.pi * step / steps))
             optimizer.param_groups[0]["lr"] = LEARNING_RATE * rate
             weight = learning[:, chosen]
-            losses = loss(_forward(tensors, inputs[chosen]), wanted[chosen])
-            optimizer.zero_grad()
-            ((losses * weight).sum(1) / weight.sum(1).clamp(min=1.0)).sum().backward()
+            weight /= weight.sum(1, keepdim=True).clamp(min=1.0)
+            _gradient(tensors, slopes, inputs[chosen], wanted[chosen], weight, loss)
             optimizer.step()
-            for mean, tensor in zip(average, tensors, strict=True):
-                mean.lerp_(tensor.detach(), 1 - AVERAGING)
+            average.lerp_(flat, 1 - AVERAGING)
             made = step + 1
             if made % EVERY == 0 or made == steps:
                 progress.update(made, steps)
-                now = held_out_loss()
+                now = scored.loss(averages, loss)
                 if now < least:
                     least, least_step = now, made
-                    for kept, tensor in zip(best, average, strict=True):
-                        kept.copy_(tensor)
+                    best.copy_(average)
                 elif made - least_step > max(60, steps // 3):
                     break
-        outputs = np.full((n, best[-1].shape[-1]), np.nan)
-        with torch.no_grad():
-            for k in range(held_out_copies):
-                left_out = np.flatnonzero(folds == k)
-                one = [tensor[1 + k : 2 + k] for tensor in best]
-                outputs[left_out] = _forward(one, inputs[torch.from_numpy(left_out)])[0].numpy()
-    arrays = [tensor.numpy() for tensor in best]
+        tensors = _views(best, shapes)
+        outputs = np.full((n, shapes[-1][-1]), np.nan)
+        for k in range(held_out_copies):
+            left_out = np.flatnonzero(folds == k)
+            one = [tensor[1 + k : 2 + k] for tensor in tensors]
+            outputs[left_out] = _forward(one, inputs[torch.from_numpy(left_out)])[-1][0].numpy()
+    arrays = [tensor.numpy() for tensor in tensors]
     return Training(Copies(arrays[0::2], arrays[1::2]), outputs, least, made)
 
 
-def _forward(tensors: Sequence[torch.Tensor], x: torch.Tensor) -> torch.Tensor:
-    """Return the outputs (M, B, m) for inputs (B, n); weights and biases alternate."""
+class _Scored:
+    """Held-out samples, those of each copy in rows of equal length, so that one pass judges all copies."""
+
+    def __init__(self, rows: Sequence[npt.NDArray[np.intp]], inputs: torch.Tensor, wanted: torch.Tensor) -> None:
+        torch = import_torch()
+        longest = max(map(len, rows), default=0)
+        index, share = np.zeros((len(rows), longest), dtype=np.int64), np.zeros((len(rows), longest), dtype=np.float32)
+        for k, one in enumerate(rows):
+            index[k, : len(one)], share[k, : len(one)] = one, 1.0
+        at = torch.from_numpy(index)
+        self._share = torch.from_numpy(share / max(1.0, share.sum()))
+        self._inputs, self._wanted = inputs[at], wanted[at]
+
+    def loss(self, tensors: Sequence[torch.Tensor], loss: Loss) -> float:
+        """Return the mean loss of samples under the copies that have not seen them; 0 if there are none."""
+        if not self._share.numel():
+            return 0.0
+        outputs = _forward([tensor[1:] for tensor in tensors], self._inputs)[-1]
+        return float((loss(outputs, self._wanted) * self._share).sum())
+
+
+def _views(flat: torch.Tensor, shapes: Sequence[tuple[int, ...]]) -> list[torch.Tensor]:
+    """Return the weights and biases that stand in one vector."""
+    ends = np.cumsum([math.prod(shape) for shape in shapes]).tolist()
+    return [flat[a:b].view(shape) for a, b, shape in zip([0, *ends], ends, shapes, strict=False)]
+
+
+def _forward(tensors: Sequence[torch.Tensor], x: torch.Tensor) -> list[torch.Tensor]:
+    """Return what enters each layer, and the outputs (M, B, m), for inputs (B, n) or (M, B, n).
+
+    Weights and biases alternate.
+    """
     torch = import_torch()
-    hidden = x.expand(tensors[0].shape[0], -1, -1)
+    passed = [x.expand(tensors[0].shape[0], -1, -1)]
     for i in range(0, len(tensors), 2):
-        hidden = torch.baddbmm(tensors[i + 1], hidden, tensors[i])
-        if i < len(tensors) - 2:
-            hidden = torch.relu(hidden)
-    return hidden
+        hidden = torch.baddbmm(tensors[i + 1], passed[-1], tensors[i])
+        passed.append(hidden.relu_() if i < len(tensors) - 2 else hidden)
+    return passed
+
+
+def _gradient(
+    tensors: Sequence[torch.Tensor],
+    slopes: Sequence[torch.Tensor],
+    x: torch.Tensor,
+    targets: torch.Tensor,
+    weight: torch.Tensor,
+    loss: Loss,
+) -> None:
+    """Write the gradient of the weighted losses, weight (M, B), into slopes, which alternate as tensors do."""
+    torch = import_torch()
+    passed = _forward(tensors, x)
+    outputs = passed.pop().requires_grad_()
+    with torch.enable_grad():
+        (back,) = torch.autograd.grad((loss(outputs, targets) * weight).sum(), outputs)
+    for i in range(len(tensors) - 2, -1, -2):
+        entered = passed.pop()
+        torch.bmm(entered.transpose(1, 2), back, out=slopes[i])
+        torch.sum(back, 1, keepdim=True, out=slopes[i + 1])
+        if i:
+            back = torch.bmm(back, tensors[i].transpose(1, 2)).mul_(entered > 0)
 
 
 def import_torch() -> Any:
@@ -247,7 +290,7 @@ def _one_thread() -> Iterator[None]:
     The number of threads belongs to the process, so fits in several threads take turns.
     """
     torch = import_torch()
-    with _fitting, torch.enable_grad():  # also where a user has switched gradients off
+    with _fitting:
         before = torch.get_num_threads()
         torch.set_num_threads(1)
         try:
