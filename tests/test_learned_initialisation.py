@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from symgraph.learned import StochasticNetwork
-from symgraph.learned.initialisation import begin_linear, initial_copies
+from symgraph.learned.initialisation import begin_linear, carries_linear, initial_copies
 
 
 def output(copies, k, x):
@@ -94,12 +94,17 @@ def test_where_no_slope_predicts_anything_they_begin_with_0():
     np.testing.assert_allclose(output(copies, 0, x), 0.0, atol=1e-6)
 
 
-def test_narrow_networks_are_left_as_they_are():
-    x, y, folds = samples(40, 0.1)
-    for hidden in ((), (3,), (20, 3)):
-        copies = initial_copies((5, *hidden, 2), x, 3, np.random.default_rng(1))
-        begin_linear(copies, x, y, folds)
-        np.testing.assert_array_equal(output(copies, 0, x), 0.0)
+def test_networks_with_fewer_units_than_twice_the_outputs_begin_at_random():
+    x, y, _ = samples(40, 0.1)
+    for hidden, carried in (((), False), ((3,), False), ((20, 3), False), ((4,), True)):
+        assert carries_linear((5, *hidden, 2)) == carried
+        weights = []
+        for start in ("random", "linear"):
+            network = StochasticNetwork({"x": 5}, {"y": 2}, hidden, error="none", start=start, decay=1.0, name="net")
+            network.fit(x, y, progress=False)
+            weights.append([parameter.value for parameter in network.parameters])
+        same = all((one == other).all() for one, other in zip(*weights, strict=True))
+        assert same != carried
 
 
 def test_a_linear_function_is_learned_from_few_samples():

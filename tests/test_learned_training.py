@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from small_tasks import assert_close
 
 from symgraph.learned import losses, training
-from symgraph.learned.initialisation import initial_copies
+from symgraph.learned.initialisation import begin_linear, initial_copies
 from symgraph.learned.perceptron import Perceptron, Scaling, rescaled
 from symgraph.learned.training import (
     FOLDS,
@@ -247,6 +247,40 @@ def test_what_cannot_be_learned_leaves_the_start_or_stops_early():
     assert result.loss <= (y**2).mean() * (1 + 1e-5)
     assert result.steps < 400
     assert result.steps % training.EVERY == 0
+
+
+def ridge(x, y, strength):
+    return np.linalg.solve(x.T @ x + strength * np.eye(x.shape[1]), x.T @ y)
+
+
+@pytest.mark.parametrize("decay", [0.5, 20.0])
+def test_without_hidden_layers_decay_is_ridge_regression(decay):
+    """The loss is a mean over outputs, so λ counts as often as there are outputs; each copy has its own samples."""
+    rng = np.random.default_rng(4)
+    x, y = rng.normal(size=(60, 3)), rng.normal(size=(60, 2))
+    folds = np.arange(60) % 5
+    x = np.vstack([x, -x])  # of mean 0 in every fold, so that biases have no part
+    y, folds = np.vstack([y, -y]), np.concatenate([folds, folds])
+    copies = Copies([np.ones((6, 3, 2), np.float32)], [np.zeros((6, 1, 2), np.float32)])
+    result = train(copies, x, y, folds, losses.squares, 3000, rng, QUIET, decay)
+    assert result.steps == 3000
+    assert_close(result.copies.weights[0][0], ridge(x, y, 2 * decay), 0.02)
+    # A copy that leaves a fold out has a mean over four fifths of the samples, and the same decay.
+    assert_close(result.copies.weights[0][1], ridge(x[folds != 0], y[folds != 0], 0.8 * 2 * decay), 0.02)
+
+
+def test_what_hands_the_linear_function_on_does_not_decay():
+    rng = np.random.default_rng(5)
+    x, y = rng.normal(size=(60, 3)), np.zeros((60, 2))
+    copies = initial_copies((3, 8, 8, 2), x, 6, rng)
+    begin_linear(copies, x, np.zeros((60, 2)), np.arange(60) % 5)
+    result = train(copies, x, y, np.arange(60) % 5, losses.squares, 1500, rng, QUIET, 1e4, linear=True)
+    for layer, weights in enumerate(result.copies.weights):
+        handed_on = weights[:, :2, :2].copy()
+        if layer:
+            assert_close(handed_on, np.broadcast_to(np.eye(2), (6, 2, 2)), 1e-3)
+            weights[:, :2, :2] = 0.0
+        assert np.abs(weights).max() < 1e-2
 
 
 def test_steps_are_as_many_as_asked_for_where_the_loss_goes_on_falling():

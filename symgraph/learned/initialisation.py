@@ -35,16 +35,20 @@ def initial_copies(sizes: Sequence[int], x: Array, count: int, rng: np.random.Ge
     return Copies(weights, biases)
 
 
+def carries_linear(sizes: Sequence[int]) -> bool:
+    """Return whether a network has units for a linear function of each output, and as many again to bend it."""
+    return min(sizes[1:-1], default=0) >= 2 * sizes[-1]
+
+
 def begin_linear(copies: Copies, x: Array, targets: Array, folds: npt.NDArray[np.int64]) -> None:
     """Let copies from `initial_copies` begin as what ridge regression makes of the samples that they learn from.
 
     Few samples show little but slopes, and a network that has to find these first stops when it has learned noise. One
     unit for each output, in every hidden layer, is above zero at all samples and hands a linear function on. How much
-    the slopes of an output are held back is what predicts best the samples that were left out. Networks with fewer
-    units in a layer than twice the outputs are left as they are: they need them to bend.
+    the slopes of an output are held back is what predicts best the samples that were left out.
 
     Args:
-        copies: copy 1 + k leaves out fold k.
+        copies: copy 1 + k leaves out fold k; of a network that `carries_linear`.
         x: (N, n) whitened inputs.
         targets: (N, m), of mean 0.
         folds: (N,) fold of each sample.
@@ -52,8 +56,6 @@ def begin_linear(copies: Copies, x: Array, targets: Array, folds: npt.NDArray[np
     Source: Hoerl & Kennard, Ridge regression, Technometrics 1970.
     """
     m = targets.shape[1]
-    if min((w.shape[2] for w in copies.weights[:-1]), default=0) < 2 * m:
-        return
     left_out = [folds == k for k in range(copies.count - 1)]
     learned = [(x[~rows], targets[~rows]) for rows in (np.zeros(len(x), dtype=bool), *left_out)]
     squares, products = [a.T @ a for a, _ in learned], [a.T @ b for a, b in learned]

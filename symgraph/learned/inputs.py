@@ -39,6 +39,13 @@ def checked_count(value: Any, place: str) -> int:
     return int(value)
 
 
+def checked_number(value: Any, place: str) -> float:
+    """Return a finite number of at least 0; raise InputError naming the place otherwise."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not 0 <= value < np.inf:
+        raise InputError(f"{place} is {value!r}; give a number of at least 0")
+    return float(value)
+
+
 def checked_resolution(given: Any, reads: Mapping[str, int], place: str) -> dict[str, list[float]]:
     """Return {label: a number of at least 0 for each element}, in the order of the labels that are read.
 

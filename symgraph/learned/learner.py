@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from symgraph.learned.initialisation import begin_linear, initial_copies
+from symgraph.learned.initialisation import begin_linear, carries_linear, initial_copies
 from symgraph.learned.perceptron import Scaling, rescaled
 from symgraph.learned.training import Copies, Folds, Loss, Training, active_folds, default_steps, train
 from symgraph.progress import Progress
@@ -94,6 +94,7 @@ class Learner:
         last_bias: Array | None = None,
         *,
         linear: bool = False,
+        decay: float = 0.0,
     ) -> tuple[Memory, Training]:
         """Train one network.
 
@@ -108,9 +109,11 @@ class Learner:
             rng: source of randomness.
             progress: to report to.
             last_bias: (m,) where a fit from scratch begins; 0 if left out.
-            linear: whether it begins as a ridge regression; the targets must be scaled.
+            linear: whether it begins as a ridge regression, if it is wide enough; the targets must be scaled.
+            decay: see `train`.
         """
         count = 1 + schedule.active
+        linear = linear and carries_linear(sizes)
         # What does not vary has no part in predictions; a network that saw how it deviates would rely on it.
         inputs = np.where(scaling[0].varies, scaling[0](x), 0.0)
         targets = y if scaling[1] is None else scaling[1](y)
@@ -124,5 +127,5 @@ class Learner:
                 begin_linear(copies, inputs, targets, schedule.folds)
         steps = default_steps(len(x), max(sizes[1:-1], default=100))
         steps = round(WARM_SHARE * steps) if schedule.warm else steps
-        training = train(copies, inputs, targets, schedule.folds, loss, steps, rng, progress)
+        training = train(copies, inputs, targets, schedule.folds, loss, steps, rng, progress, decay, linear)
         return Memory(training.copies, *scaling), training

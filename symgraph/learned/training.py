@@ -132,8 +132,13 @@ def train(
     steps: int,
     rng: np.random.Generator,
     progress: Progress,
+    decay: float = 0.0,
+    linear: bool = False,
 ) -> Training:
     """Minimise a loss by Adam with a falling rate, all copies in one step, and keep the best weights on the way.
+
+    With a decay λ the loss is mean loss + λ ‖w‖² / N, the most probable weights under a Gaussian prior, and the last
+    weights are kept: what λ holds back need not be stopped early.
 
     Gradients go back through the layers by hand: with few samples an automatic one costs several times the sums.
 
@@ -143,9 +148,11 @@ def train(
         targets: (N, m).
         folds: (N,) fold of each sample.
         loss: of each copy and sample.
-        steps: at most; fewer when the held-out loss no longer falls.
+        steps: at most; fewer when the held-out loss no longer falls, unless weights decay.
         rng: draws the samples of each step.
         progress: is told of the steps.
+        decay: λ, of all weights but biases.
+        linear: whether the copies come from `begin_linear`: what only hands the linear function on does not decay.
 
     Source: Kingma & Ba, Adam, ICLR 2015.
     """
@@ -167,6 +174,11 @@ def train(
     )
     average, best, slope = flat.clone(), flat.clone(), torch.zeros_like(flat)
     tensors, averages, slopes = (_views(one, shapes) for one in (flat, average, slope))
+    pull = torch.zeros_like(flat)  # decay in the direction of each weight
+    for i, part in enumerate(_views(pull, shapes)[::2]):
+        part.fill_(2 * decay / n)
+        if linear and i:
+            part[:, : shapes[-1][-1], : shapes[-1][-1]] = 0.0
     batch = min(n, max(32, COLUMNS // copies.count))
     order, at = rng.permutation(n), 0
     with _one_thread(), torch.no_grad():
@@ -184,13 +196,15 @@ def train(
             weight = learning[:, chosen]
             weight /= weight.sum(1, keepdim=True).clamp(min=1.0)
             _gradient(tensors, slopes, inputs[chosen], wanted[chosen], weight, loss)
+            if decay:
+                slope.addcmul_(pull, flat)
             optimizer.step()
             average.lerp_(flat, 1 - AVERAGING)
             made = step + 1
             if made % EVERY == 0 or made == steps:
                 progress.update(made, steps)
                 now = scored.loss(averages, loss)
-                if now < least:
+                if decay or now < least:
                     least, least_step = now, made
                     best.copy_(average)
                 elif made - least_step > max(60, steps // 3):
