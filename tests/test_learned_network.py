@@ -124,6 +124,24 @@ def test_predicted_spread_of_a_gaussian_is_that_of_draws(fitted):
     np.testing.assert_allclose(np.diag(found), np.diag(expected), rtol=0.1)
 
 
+def test_a_network_taken_for_certain_has_no_spread_of_its_own(fitted):
+    x, sigma = np.array([0.3, -0.2, 0.5]), np.diag([0.04, 0.04, 0.0])
+
+    def look(model):
+        with model.certain():
+            assert not model.predict(x)[1].any()
+            assert model.predict(x, sigma)[1].trace() > 0
+            np.testing.assert_array_equal(model.predict(x)[0], before[0])
+            raise KeyError
+
+    for model in fitted.values():
+        before = *model.predict(x), *model.predict(x, sigma)
+        with pytest.raises(KeyError):
+            look(model)
+        for was, now in zip(before, (*model.predict(x), *model.predict(x, sigma)), strict=True):
+            np.testing.assert_array_equal(now, was)
+
+
 def test_an_unfitted_network_predicts_finite_numbers_and_says_what_it_lacks():
     one = network()
     y, spread = one.predict(np.zeros(3))

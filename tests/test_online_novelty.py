@@ -1,5 +1,7 @@
 """Which choices a loop draws: those known least in a situation, by what was executed before."""
 
+from contextlib import contextmanager
+
 import numpy as np
 import pytest
 from online_worlds import ALWAYS, NOTHING, Scripted, Spy, carry_graph, carrying, kick_graph, kick_slots, loop
@@ -134,3 +136,39 @@ def test_each_attempt_of_an_episode_counts_as_made(tmp_path):
         ways = [visit.selections["way"] for visit in one.store.visits() if visit.node in ("thrown", "rolled")]
     assert len(ways) > 12
     assert all(set(pair) == {"high", "low"} for pair in zip(ways[::2], ways[1::2], strict=False))
+
+
+@pytest.mark.parametrize("drawn", [True, False])
+def test_what_is_drawn_is_planned_as_if_models_were_certain(tmp_path, drawn):
+    """A cautious plan kicks "far" gently, for its spread grows with the kick: what it does then it never learns."""
+    near, _ = spies()
+    wide = Wide({"u": 1, "s": 1}, {"y": 1}, "far", [1.5, 0.0])
+    world = Scripted({"s": 0.0}, {"aim": lambda a, s, world: {f"{s['skill']}_end": {"y": 1.5 * a["u"]}}})
+    explore = ALL if drawn else NOTHING
+    with loop(tmp_path, kick_graph(near, wide), world, 6, explore) as one:
+        reports = list(one)
+    kicked = [actions["u"] for _, actions, selections in world.calls if selections["skill"] == "far"]
+    assert len(kicked) >= 3
+    # E = -(1.5 u - 1)^2 - (s u)^2 is greatest at u = 1.5 / (2.25 + s^2), with s = 3 unless it is certain
+    assert kicked == pytest.approx([1.0 / 1.5 if drawn else 1.5 / 11.25] * len(kicked), abs=1e-3)
+    assert wide.spread.value == 3.0
+    assert all(report.status == "done" for report in reports)
+
+
+class Wide(Spy):
+    """A model whose standard deviation is three times the kick."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.spread = sg.Parameter(3.0, "spread")
+        self.parameters = (*self.parameters, self.spread)
+
+    def propagate(self, inputs):
+        mean = super().propagate(inputs)["y"].mean
+        return {"y": sg.Gaussian(mean, (self.spread.symbol * inputs["u"].mean) ** 2)}
+
+    @contextmanager
+    def certain(self):
+        kept, self.spread.value = self.spread.value, 0.0
+        yield
+        self.spread.value = kept

@@ -6,7 +6,8 @@ import copy
 import inspect
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -92,6 +93,11 @@ class LearnedModel(ABC):
     def lacking(self) -> str | None:
         """What is missing before it can be used, e.g. "2 of 3 samples"; None when nothing is."""
         return None if self.samples >= self.samples_needed else f"{self.samples} of {self.samples_needed} samples"
+
+    @contextmanager
+    def certain(self) -> Iterator[None]:
+        """Let plans, in between, take what it predicts for exact; what its inputs leave open is still passed on."""
+        yield
 
     def with_propagation(self, rule: str) -> Self:
         """Return a view under another rule: the same weights, now and after further fits.

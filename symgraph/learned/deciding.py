@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import zlib
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,6 +41,7 @@ class Planning:
         attempts: how often the graph is gone through, at most.
         seed: of all that is random.
         informative: states that tell situations apart, in which a choice may be known or not.
+        models: that are learned, and can be taken for certain.
     """
 
     graph: Graph
@@ -49,6 +51,7 @@ class Planning:
     attempts: int
     seed: int
     informative: tuple[str, ...]
+    models: tuple[Any, ...]
 
 
 class Decider:
@@ -92,6 +95,7 @@ class Decider:
         self._recalled = recalled or {}
         self._note = note
         self._fixed: dict[str, Any] = {}
+        self._curious = False
         self._disturbance: dict[str, Any] = {}
         self._ends: set[int] = set()  # steps from which the world may lead back
         self.decision: Decision = {}, {}
@@ -150,6 +154,7 @@ class Decider:
             for label, slot in graph.selections().items()
         }
         actions = {label: rng.uniform(slot.lower, slot.upper) for label, slot in graph.actions().items()}
+        self._curious = bool(draws_selections and selections)
         self._fixed = {**(selections if draws_selections else {}), **(actions if draws_actions else {})}
         self._disturbance = {
             label: self._explore.noise * rng.standard_normal(slot.size) * (slot.upper - slot.lower)
@@ -161,15 +166,21 @@ class Decider:
         graph, objective = self._planning.graph, self._planning.objectives[visit.node]
         known = self._knowledge.at[visit.step]
         actions, selections = self.decision
-        plan = solve(
-            objective,
-            {label: known[label] for label in graph.states() if label in known},
-            self._planning.optimizer,
-            guess=[*([{**actions, **selections}] if actions or selections else []), *self._starts],
-            fixed=self._fixed,
-            seed=zlib.crc32(repr((self._planning.seed, self._number, visit.step)).encode()),
-            progress=False,
-        )
+        with ExitStack() as certainty:
+            if self._curious:
+                # A choice that is tried because it is known little must be given its best chance: planned for all that
+                # may go wrong, it would be done where nothing can go right either, and would never be learned.
+                for model in self._planning.models:
+                    certainty.enter_context(model.certain())
+            plan = solve(
+                objective,
+                {label: known[label] for label in graph.states() if label in known},
+                self._planning.optimizer,
+                guess=[*([{**actions, **selections}] if actions or selections else []), *self._starts],
+                fixed=self._fixed,
+                seed=zlib.crc32(repr((self._planning.seed, self._number, visit.step)).encode()),
+                progress=False,
+            )
         if plan.status.startswith("interrupted"):  # solve returns what it has; the loop is to stop
             raise KeyboardInterrupt
         explores = plan.status.startswith("exploring")

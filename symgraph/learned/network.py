@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -140,6 +141,16 @@ class StochasticNetwork(LearnedModel):
         if self.error == "none":
             return self._mean.parameters
         return (*self._mean.parameters, *self._error.parameters, self._error_scale)
+
+    @contextmanager
+    def certain(self) -> Iterator[None]:
+        """Let plans, in between, take what it predicts for exact: σ = 0; the spread of inputs is still passed on."""
+        scale = self._error_scale.value
+        self._error_scale.value = np.zeros_like(scale)
+        try:
+            yield
+        finally:
+            self._error_scale.value = scale
 
     def propagate(self, inputs: Mapping[str, Gaussian]) -> dict[str, Gaussian]:
         """Return the Gaussians of what it writes, as expressions of its parameters."""
