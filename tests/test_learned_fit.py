@@ -58,7 +58,8 @@ def test_fit_is_warm_until_the_samples_have_grown_by_half():
     assert not one.fit(x[:40], y[:40]).warm
     warm = one.fit(x[:50], y[:50])
     assert warm.warm
-    assert warm.steps[0] < 0.4 * default_steps(50, 16)
+    assert 100 < warm.steps[0] < 0.4 * default_steps(50, 16)
+    assert one.fit(x[:51], y[:51]).steps[0] <= 60  # less is new
     assert not one.fit(x, y).warm
     assert not one.fit(*samples(60, seed=9)).warm  # as many, but others
 

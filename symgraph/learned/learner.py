@@ -15,7 +15,8 @@ from symgraph.progress import Progress
 from symgraph.slots import Array
 
 GROWTH = 1.5  # times the samples of the last fit from scratch at which one begins anew
-WARM_SHARE = 0.3  # of the steps from scratch that a warm start takes
+WARM_SHARE = 0.3  # of the steps from scratch that a warm start takes if a tenth of its samples is new
+LEAST_WARM = 60  # steps of a warm start, however little is new
 
 
 @dataclass
@@ -39,6 +40,7 @@ class Schedule:
     folds: npt.NDArray[np.int64]
     active: int
     warm: bool
+    news: float  # share of the samples that no fit has seen
 
 
 class Learner:
@@ -73,12 +75,13 @@ class Learner:
         n = len(columns[0])
         if warm is None:
             warm = self.folds.count_first(self.begun_with, *columns) > n / GROWTH
+        news = 1 - self.folds.count_first(len(self.folds.known), *columns) / n
         if not warm:
             self.folds = Folds()
         folds = self.folds.assign(*columns)
         if not warm:
             self.begun_with = len(self.folds.known)
-        return Schedule(folds, active_folds(n), warm)
+        return Schedule(folds, active_folds(n), warm, news)
 
     def fit(
         self,
@@ -126,6 +129,7 @@ class Learner:
             if linear:
                 begin_linear(copies, inputs, targets, schedule.folds)
         steps = default_steps(len(x), max(sizes[1:-1], default=100))
-        steps = round(WARM_SHARE * steps) if schedule.warm else steps
+        if schedule.warm:
+            steps = max(LEAST_WARM, round(WARM_SHARE * min(1.0, 10 * schedule.news) * steps))
         training = train(copies, inputs, targets, schedule.folds, loss, steps, rng, progress, decay, linear)
         return Memory(training.copies, *scaling), training

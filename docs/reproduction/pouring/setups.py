@@ -35,7 +35,7 @@ RESULTS = FOLDER / "results.csv"
 TARGET = 0.3
 BONUS, BONUS_EPISODES = 10.0, 10  # the paper's reward shaping: for the favoured skill, in the first episodes of a stage
 LAST = 20  # episodes of a run that count as "after learning"
-SEEDS = 400  # of run 0, the next ones count from there: lower seeds served to find out what works
+SEEDS = 500  # of run 0, the next ones count from there: lower seeds served to find out what works
 FRESH = 10**6  # seeds of situations that no run meets: those of runs are spread over 32 bits
 
 SETUPS = {  # arguments of PouringWorld
@@ -123,7 +123,7 @@ CONDITIONS = [
     Condition("general", "PT0-Rnone, both skills tried", 80, BOTH_SKILLS),
     Condition("general", "PT0-Rnone, both skills tried, one attempt", 80, BOTH_SKILLS, attempts=1),
     # What narrow layers make of 80 episodes wider ones do not; with 300 or more, plans of wider ones are better.
-    Condition("varied", "PT0-Rnone, both skills tried", 300, BOTH_SKILLS_VARIED, hidden=(64, 64)),
+    Condition("varied", "PT0-Rnone, both skills tried", 500, BOTH_SKILLS_VARIED, hidden=(64, 64)),
 ]
 
 
