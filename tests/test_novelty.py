@@ -44,12 +44,17 @@ def test_where_all_situations_are_the_same_choices_take_turns():
     assert len(least([0.3], *tries)) == 2
 
 
+def test_many_tries_nearby_outweigh_one_that_is_nearer():
+    tips = [([0.1 * k], "tip") for k in range(10)]
+    assert least([0.45], *tips, ([0.44], "shake"), ([2.0], "shake")) == ["shake"]
+
+
 def test_an_element_that_a_try_does_not_know_counts_as_two_independent_draws():
     # The first elements known are 0, 2, 0, 2, so that their deviation is 1; the second is the same everywhere.
     known = [([2.0 * (k % 2), 7.0], "tip") for k in range(4)]
-    assert least([1.4, 7.0], *known, ([np.nan, 7.0], "shake")) == ["shake"]  # 0.6² < 2
-    assert least([3.4, 7.0], *known, ([np.nan, 7.0], "shake")) == ["shake"]  # 1.4² < 2
-    assert least([3.5, 7.0], *known, ([np.nan, 7.0], "shake")) == ["tip"]  # 1.5² > 2
+    assert least([1.4, 7.0], *known, ([np.nan, 7.0], "shake")) == ["shake"]
+    assert least([3.8, 7.0], *known, ([np.nan, 7.0], "shake")) == ["shake"]  # 2 exp(-1.8² / 2) > exp(-2 / 2)
+    assert least([3.9, 7.0], *known, ([np.nan, 7.0], "shake")) == ["tip"]  # 2 exp(-1.9² / 2) < exp(-2 / 2)
 
 
 def test_an_element_that_is_not_known_here_says_nothing():
@@ -87,20 +92,19 @@ situations = st.lists(numbers, min_size=2, max_size=2)
     st.sampled_from([0.25, 2.0, 64.0]),
     st.integers(-4, 4),
 )
-def test_units_do_not_matter(here, pairs, scale, offset):
+def test_the_density_of_tries_decides_in_any_units(here, pairs, scale, offset):
     def in_other_units(where):
         return [where[0] * scale + offset, where[1]]
 
-    nearest = {
-        skill: min((np.hypot(*(np.subtract(where, here))) for where, one in pairs if one == skill), default=np.inf)
-        for skill in SKILLS
-    }
+    sd = np.std([where for where, _ in pairs], axis=0)
+    counted = dict.fromkeys(SKILLS, 0.0)
+    for where, skill in pairs:
+        offsets = [(x - y) / d for x, y, d in zip(where, here, sd, strict=True) if d > 0.0]
+        counted[skill] += np.exp(-(np.linalg.norm(offsets) ** 2) / 2)
     found = least(here, *pairs)
-    assert found
-    if 0.0 in nearest.values() and len(set(nearest.values())) == 2 and len({tuple(where) for where, _ in pairs}) > 2:
-        assert all(nearest[skill] > 0.0 for skill in found)
     other = least(in_other_units(here), *[(in_other_units(where), skill) for where, skill in pairs])
-    assert set(other) & set(found)  # ties may break by rounding
+    for one in (*found, *other):  # ties may break by rounding
+        assert counted[one] <= min(counted.values()) * (1 + 1e-9)
 
 
 def test_only_what_is_known_at_the_start_tells_situations_apart():

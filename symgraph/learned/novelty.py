@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
@@ -33,12 +32,12 @@ def situation_of(graph: Graph, labels: Iterable[str], known: Known, at_start: Kn
 
 
 def least_known(selection: str, choices: Sequence[str], situation: Array, tries: Sequence[Try]) -> list[str]:
-    """Return the choices whose nearest try lies farthest from a situation; of equals, those made least often.
+    """Return the choices that have been tried least in situations like one.
 
-    Nearness is the distance of the situations, each element in standard deviations over all tries. A skill that has
-    been tried a hundred times with paste is still unknown for water. An element that a try does not know counts as two
-    independent draws would be expected to, 2 squared deviations; one that is not known in the situation, or that does
-    not vary, says nothing.
+    A try counts exp(-d²/2), with d its distance from the situation, each element in standard deviations over all tries:
+    the density of tries, as a Gaussian kernel estimates it. A skill that has been tried a hundred times with paste is
+    still unknown for water. An element that a try does not know counts as two independent draws would be expected to,
+    2 squared deviations; one that is not known in the situation, or that does not vary, says nothing.
 
     Args:
         selection: the selection.
@@ -55,11 +54,12 @@ def least_known(selection: str, choices: Sequence[str], situation: Array, tries:
     sd = unit * np.ma.masked_invalid(seen / unit).std(axis=0).filled(0.0)
     tells = (sd > SMALLEST_SPREAD * unit) & ~np.isnan(situation)
     offsets = (seen[:, tells] - situation[tells]) / sd[tells]
-    distances = np.hypot.reduce(np.where(np.isnan(offsets), math.sqrt(2.0), offsets), axis=1)
-
-    def unknown(choice: str) -> tuple[float, int]:
-        at = [i for i, one in enumerate(made) if one == choice]
-        return min((float(distances[i]) for i in at), default=np.inf), -len(at)
-
-    most = max(map(unknown, choices))
-    return [choice for choice in choices if unknown(choice) == most]
+    squares = np.where(np.isnan(offsets), 2.0, offsets**2).sum(axis=1)
+    counted = {
+        choice: float(
+            np.logaddexp.reduce([-square / 2 for one, square in zip(made, squares, strict=True) if one == choice])
+        )
+        for choice in choices
+    }  # logarithms, which tell tries apart however far they all are
+    least = min(counted.values())
+    return [choice for choice in choices if counted[choice] == least]

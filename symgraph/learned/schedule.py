@@ -46,9 +46,9 @@ class Exploration:
 
     Args:
         selections: probability that an attempt's selections are drawn instead of planned, in the first episode. What is
-            drawn is the choice known least: its nearest try, of any stage, lies farthest from the situation. Situations
-            are told apart by those states that learned models read and that are known where an episode starts. The rest
-            is planned as if learned models were certain.
+            drawn is the choice known least: the one with the lowest density of tries, of all stages, in the situation.
+            Situations are told apart by those states that learned models read and that are known where an episode
+            starts. The rest is planned as if learned models were certain.
         actions: probability that its actions are drawn from their whole range, in the first episode.
         noise: standard deviation of what is added to actions that are not drawn, as a share of their range, in the
             first episode.
