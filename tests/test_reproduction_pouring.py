@@ -270,6 +270,8 @@ def test_policies_pour_anew_where_seeds_have_changed(tmp_path, monkeypatch, caps
         return [job.run for job in poured.pop()]
 
     assert main().count("0") == 80
+    baselines.main(runs=1, fresh=3, tries=2, processes=1, only=["rule"], results=path)
+    assert [job.policy for job in poured.pop()] == ["rule"] * (3 + 3 + 20)
     jobs = [
         baselines.Job(setup, policy, run, situation, 2)
         for setup, run, situation in (("general", "0", 60), ("general", "fresh", 0))

@@ -13,6 +13,7 @@ import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -206,6 +207,7 @@ def main(
     fresh: Annotated[int, typer.Option(min=0, help="Situations that no run meets, of each setup.")] = 100,
     tries: Annotated[int, typer.Option(min=2, help="Of which the best is taken, in the setup varied.")] = 30,
     processes: Annotated[int, typer.Option(min=1)] = 2,
+    only: Annotated[list[str] | None, typer.Option(help='Policies such as "always*".')] = None,
     results: Annotated[Path, typer.Option(help="File of the episodes.")] = BASELINES,
 ) -> None:
     """Pour, where it has not been done already."""
@@ -220,7 +222,8 @@ def main(
     where += [("general", str(run), k) for run in range(runs) for k in last]
     jobs = [Job(setup, name, run, k, tries) for setup, run, k in where for name in POLICIES]
     jobs += [Job("varied", BEST, FRESH_RUN, k, tries) for k in range(fresh)]
-    jobs = [job for job in jobs if job.key not in done]
+    wanted = [job for job in jobs if any(fnmatch(job.policy, pattern) for pattern in only or ["*"])]
+    jobs = [job for job in wanted if job.key not in done]
     with display() as progress:
         bar = progress.add_task("pouring", total=len(jobs))
         work(
