@@ -124,22 +124,21 @@ def test_predicted_spread_of_a_gaussian_is_that_of_draws(fitted):
     np.testing.assert_allclose(np.diag(found), np.diag(expected), rtol=0.1)
 
 
-def test_a_network_taken_for_certain_has_no_spread_of_its_own(fitted):
+def test_without_its_spreads_a_network_is_certain(fitted):
     x, sigma = np.array([0.3, -0.2, 0.5]), np.diag([0.04, 0.04, 0.0])
-
-    def look(model):
-        with model.certain():
+    for error, model in fitted.items():
+        assert len(model.spreads) == (error != "none")
+        mean, kept = model.predict(x)[0], [parameter.value for parameter in model.spreads]
+        for parameter in model.spreads:
+            assert any(parameter is other for other in model.parameters)
+            parameter.value = np.zeros_like(parameter.value)
+        try:
+            np.testing.assert_array_equal(model.predict(x)[0], mean)
             assert not model.predict(x)[1].any()
             assert model.predict(x, sigma)[1].trace() > 0
-            np.testing.assert_array_equal(model.predict(x)[0], before[0])
-            raise KeyError
-
-    for model in fitted.values():
-        before = *model.predict(x), *model.predict(x, sigma)
-        with pytest.raises(KeyError):
-            look(model)
-        for was, now in zip(before, (*model.predict(x), *model.predict(x, sigma)), strict=True):
-            np.testing.assert_array_equal(now, was)
+        finally:
+            for parameter, value in zip(model.spreads, kept, strict=True):
+                parameter.value = value
 
 
 def test_an_unfitted_network_predicts_finite_numbers_and_says_what_it_lacks():
@@ -310,6 +309,11 @@ X, Y = samples(4)
             ["error = 'mle'", "'likelihood', 'paper', 'none'"],
         ),
         (lambda: StochasticNetwork({"x": 1}, {"y": 1}, samples_needed=0), ["samples_needed is 0"]),
+        (lambda: network(start="flat"), ["network: start = 'flat'", "'random', 'linear'"]),
+        *(
+            (lambda decay=decay: network(decay=decay), ["network: decay is", "give a number of at least 0"])
+            for decay in (-1.0, np.nan, np.inf, "1", True, 1j, 10**400)
+        ),
         (lambda: network(name="F").fit(X[:, :2], Y), ["F: x has shape (4, 2); give (N, 3)"]),
         (lambda: network(name="F").fit(X, Y[:3]), ["F: x has 4 rows, y 3"]),
         (lambda: network().fit(X * np.nan, Y), ["x[0] = [nan, nan, nan] is not finite; leave such rows out"]),

@@ -82,10 +82,12 @@ def test_views_take_part(saved):
     assert restored.samples == 45
 
 
-@pytest.mark.parametrize("error", ["likelihood", "paper", "none"])
+@pytest.mark.parametrize(
+    "options", [{}, {"error": "paper"}, {"error": "none"}, {"start": "linear", "decay": 1.0}], ids=str
+)
 @pytest.mark.parametrize("begun", [False, True])
-def test_the_next_fit_is_that_of_the_model_that_was_saved(error, begun, tmp_path):
-    network, restored = fitted(error), unfitted(error)
+def test_the_next_fit_is_that_of_the_model_that_was_saved(options, begun, tmp_path):
+    network, restored = fitted(**options), unfitted(**options)
     if begun:
         restored.fit(X[:7] + 1.0, Y[:7], progress=False)
     network.save(tmp_path / "network")

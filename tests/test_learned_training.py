@@ -253,34 +253,72 @@ def ridge(x, y, strength):
     return np.linalg.solve(x.T @ x + strength * np.eye(x.shape[1]), x.T @ y)
 
 
-@pytest.mark.parametrize("decay", [0.5, 20.0])
-def test_without_hidden_layers_decay_is_ridge_regression(decay):
-    """The loss is a mean over outputs, so λ counts as often as there are outputs; each copy has its own samples."""
-    rng = np.random.default_rng(4)
+@pytest.fixture
+def to_the_end(monkeypatch):
+    """Let a training learn from all samples in each step and keep its last weights, whatever was held out."""
+    monkeypatch.setattr(training, "COLUMNS", 10**6)
+    scores = itertools.count(0, -1)
+    monkeypatch.setattr(training._Scored, "loss", lambda *arguments: next(scores))
+
+
+def mirrored(rng):
+    """Samples whose mean is 0 in every fold, so that biases have no part."""
     x, y = rng.normal(size=(60, 3)), rng.normal(size=(60, 2))
-    folds = np.arange(60) % 5
-    x = np.vstack([x, -x])  # of mean 0 in every fold, so that biases have no part
-    y, folds = np.vstack([y, -y]), np.concatenate([folds, folds])
+    return np.vstack([x, -x]), np.vstack([y, -y]), np.tile(np.arange(60) % 5, 2)
+
+
+@pytest.mark.parametrize("decay", [0.5, 40.0])
+def test_without_hidden_layers_decay_is_ridge_regression(decay, to_the_end):
+    """Of the strength λ, for every number of outputs, and for each copy with its own samples."""
+    rng = np.random.default_rng(4)
+    x, y, folds = mirrored(rng)
     copies = Copies([np.ones((6, 3, 2), np.float32)], [np.zeros((6, 1, 2), np.float32)])
-    result = train(copies, x, y, folds, losses.squares, 3000, rng, QUIET, decay)
-    assert result.steps == 3000
-    assert_close(result.copies.weights[0][0], ridge(x, y, 2 * decay), 0.02)
-    # A copy that leaves a fold out has a mean over four fifths of the samples, and the same decay.
-    assert_close(result.copies.weights[0][1], ridge(x[folds != 0], y[folds != 0], 0.8 * 2 * decay), 0.02)
+    result = train(copies, x, y, folds, losses.squares, 3000, rng, QUIET, decay=decay)
+    assert_close(result.copies.weights[0][0], ridge(x, y, decay), 1e-3)
+    assert_close(result.copies.weights[0][1], ridge(x[folds != 0], y[folds != 0], decay), 1e-3)
 
 
-def test_what_hands_the_linear_function_on_does_not_decay():
+@pytest.mark.parametrize("hidden", [(8,), (8, 6)])
+def test_a_linear_start_stays_a_ridge_regression_where_nothing_bends(hidden, to_the_end):
+    """Units of which nothing is handed on cannot make up for slopes that decay."""
     rng = np.random.default_rng(5)
-    x, y = rng.normal(size=(60, 3)), np.zeros((60, 2))
-    copies = initial_copies((3, 8, 8, 2), x, 6, rng)
-    begin_linear(copies, x, np.zeros((60, 2)), np.arange(60) % 5)
-    result = train(copies, x, y, np.arange(60) % 5, losses.squares, 1500, rng, QUIET, 1e4, linear=True)
-    for layer, weights in enumerate(result.copies.weights):
-        handed_on = weights[:, :2, :2].copy()
+    x, y, folds = mirrored(rng)
+    copies = initial_copies((3, *hidden, 2), x, 6, rng)
+    begin_linear(copies, x, y, folds)
+    for layer, (weights, biases) in enumerate(zip(copies.weights, copies.biases, strict=True)):
+        if layer < len(hidden):  # the other units are dead
+            weights[:, :, 2:], biases[:, :, 2:] = 0.0, 0.0
         if layer:
-            assert_close(handed_on, np.broadcast_to(np.eye(2), (6, 2, 2)), 1e-3)
-            weights[:, :2, :2] = 0.0
-        assert np.abs(weights).max() < 1e-2
+            weights[:, 2:] = 0.0
+    result = train(copies, x, y, folds, losses.squares, 3000, rng, QUIET, decay=40.0, linear=True)
+    assert_close(result.copies.weights[0][0, :, :2], ridge(x, y, 40.0), 1e-3)
+    for weights in result.copies.weights[1:]:
+        np.testing.assert_array_equal(weights[:, :2, :2], np.broadcast_to(np.eye(2), (6, 2, 2)))
+
+
+def test_decay_shrinks_what_bends(to_the_end):
+    sizes = []
+    for decay in (0.0, 1e4):
+        rng = np.random.default_rng(5)
+        x, y, folds = mirrored(rng)
+        copies = initial_copies((3, 8, 2), x, 6, rng)
+        result = train(copies, x, y, folds, losses.squares, 1500, rng, QUIET, decay=decay)
+        sizes.append(max(np.abs(weights).max() for weights in result.copies.weights))
+    assert sizes[0] > 0.5
+    assert sizes[1] < 1e-2
+
+
+@pytest.mark.parametrize("lengths", [(3, 5, 4), (3, 0, 4), (7,), ()])
+def test_held_out_samples_are_judged_by_their_own_copy_once(lengths):
+    rng = np.random.default_rng(6)
+    n = sum(lengths) + 2
+    x, y = (torch.from_numpy(rng.normal(size=(n, size)).astype(np.float32)) for size in (3, 2))
+    copies = random_copies((3, 4, 2), 1 + len(lengths), rng)
+    rows = np.split(rng.permutation(n)[: sum(lengths)], np.cumsum(lengths)[:-1]) if lengths else []
+    tensors = [torch.from_numpy(a) for pair in zip(copies.weights, copies.biases, strict=True) for a in pair]
+    found = training._Scored(rows, x, y).loss(tensors, losses.squares)
+    each = [((outputs(copies, x.numpy()[at])[1 + k] - y.numpy()[at]) ** 2).mean(axis=-1) for k, at in enumerate(rows)]
+    assert found == pytest.approx(np.concatenate(each).mean() if each else 0.0, rel=1e-5)
 
 
 def test_steps_are_as_many_as_asked_for_where_the_loss_goes_on_falling():

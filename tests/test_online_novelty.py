@@ -1,7 +1,5 @@
 """Which choices a loop draws: those known least in a situation, by what was executed before."""
 
-from contextlib import contextmanager
-
 import numpy as np
 import pytest
 from online_worlds import ALWAYS, NOTHING, Scripted, Spy, carry_graph, carrying, kick_graph, kick_slots, loop
@@ -165,13 +163,8 @@ class Wide(Spy):
         super().__init__(*arguments)
         self.spread = sg.Parameter(3.0, "spread")
         self.parameters = (*self.parameters, self.spread)
+        self.spreads = (self.spread,)
 
     def propagate(self, inputs):
         mean = super().propagate(inputs)["y"].mean
         return {"y": sg.Gaussian(mean, (self.spread.symbol * inputs["u"].mean) ** 2)}
-
-    @contextmanager
-    def certain(self):
-        kept, self.spread.value = self.spread.value, 0.0
-        yield
-        self.spread.value = kept

@@ -6,8 +6,7 @@ import copy
 import inspect
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -94,10 +93,10 @@ class LearnedModel(ABC):
         """What is missing before it can be used, e.g. "2 of 3 samples"; None when nothing is."""
         return None if self.samples >= self.samples_needed else f"{self.samples} of {self.samples_needed} samples"
 
-    @contextmanager
-    def certain(self) -> Iterator[None]:
-        """Let plans, in between, take what it predicts for exact; what its inputs leave open is still passed on."""
-        yield
+    @property
+    def spreads(self) -> tuple[Parameter, ...]:
+        """Parameters that make it certain where they are 0, so that only the spread of its inputs is passed on."""
+        return ()
 
     def with_propagation(self, rule: str) -> Self:
         """Return a view under another rule: the same weights, now and after further fits.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 import zlib
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +18,7 @@ from symgraph.learned.knowledge import Knowledge
 from symgraph.learned.novelty import Try, least_known, situation_of
 from symgraph.learned.records import Visit
 from symgraph.learned.schedule import Exploration
+from symgraph.model import Parameter
 from symgraph.objective import Objective
 from symgraph.optimizers.problem import Optimizer
 from symgraph.plan import Plan
@@ -41,7 +42,7 @@ class Planning:
         attempts: how often the graph is gone through, at most.
         seed: of all that is random.
         informative: states that tell situations apart, in which a choice may be known or not.
-        models: that are learned, and can be taken for certain.
+        spreads: parameters of learned models that make them certain where they are 0.
     """
 
     graph: Graph
@@ -51,7 +52,7 @@ class Planning:
     attempts: int
     seed: int
     informative: tuple[str, ...]
-    models: tuple[Any, ...]
+    spreads: tuple[Parameter, ...]
 
 
 class Decider:
@@ -95,7 +96,7 @@ class Decider:
         self._recalled = recalled or {}
         self._note = note
         self._fixed: dict[str, Any] = {}
-        self._curious = False
+        self._made: set[str] = set()  # selections that have mattered in this attempt
         self._disturbance: dict[str, Any] = {}
         self._ends: set[int] = set()  # steps from which the world may lead back
         self.decision: Decision = {}, {}
@@ -128,7 +129,7 @@ class Decider:
             self.plans[visit.step] = notes
             self._take_over(notes)
             self.seconds += time.perf_counter() - begin
-        self._tries += _tries_at(self._planning, self._knowledge, visit, self.decision[1])
+        self._tries += _tries_at(self._planning, self._knowledge, visit, self.decision[1], self._made)
         return self.decision
 
     def recall(self) -> None:
@@ -147,6 +148,7 @@ class Decider:
         graph = self._planning.graph
         rng = np.random.default_rng([self._planning.seed, self._number, self.attempts, DRAWS])
         self.attempts += 1
+        self._made = set()
         draws_selections, draws_actions = rng.random(2) < (self._explore.selections, self._explore.actions)
         situation = _situation(self._planning, self._knowledge, visit.step)
         selections = {
@@ -154,7 +156,6 @@ class Decider:
             for label, slot in graph.selections().items()
         }
         actions = {label: rng.uniform(slot.lower, slot.upper) for label, slot in graph.actions().items()}
-        self._curious = bool(draws_selections and selections)
         self._fixed = {**(selections if draws_selections else {}), **(actions if draws_actions else {})}
         self._disturbance = {
             label: self._explore.noise * rng.standard_normal(slot.size) * (slot.upper - slot.lower)
@@ -166,12 +167,11 @@ class Decider:
         graph, objective = self._planning.graph, self._planning.objectives[visit.node]
         known = self._knowledge.at[visit.step]
         actions, selections = self.decision
-        with ExitStack() as certainty:
-            if self._curious:
-                # A choice that is tried because it is known little must be given its best chance: planned for all that
-                # may go wrong, it would be done where nothing can go right either, and would never be learned.
-                for model in self._planning.models:
-                    certainty.enter_context(model.certain())
+        ahead = _ahead(objective.tree)
+        # A choice that is tried because it is known little must be given its best chance: planned for all that may go
+        # wrong, it would be done where nothing can go right either, and would never be learned.
+        curious = any(label in self._fixed and label in ahead for label in graph.selections())
+        with _as_zero(self._planning.spreads if curious else ()):
             plan = solve(
                 objective,
                 {label: known[label] for label in graph.states() if label in known},
@@ -184,7 +184,6 @@ class Decider:
         if plan.status.startswith("interrupted"):  # solve returns what it has; the loop is to stop
             raise KeyboardInterrupt
         explores = plan.status.startswith("exploring")
-        ahead = _ahead(objective.tree)
         # What lies behind stays as it was.
         decided = {
             label: value if explores else self._disturbed(label, value)
@@ -213,26 +212,54 @@ class Decider:
 
 
 def tries_of(planning: Planning, knowledge: Knowledge, visits: Sequence[Visit], info: Mapping[str, Any]) -> list[Try]:
-    """Return the choices that were executed in an episode, from its visits and what was noted when it ended."""
+    """Return the choices that were executed in an episode, from its visits and what was noted when it ended.
+
+    A choice is one try in an attempt, where it first mattered.
+    """
     left = {visit.parent: visit.selections for visit in visits if visit.parent is not None}
     if "failed_at" in info:
         left[info["failed_at"]] = info["selections"]
-    return [one for step, made in left.items() for one in _tries_at(planning, knowledge, visits[step], made)]
+    tries: list[Try] = []
+    made: set[str] = set()
+    for step, selections in sorted(left.items()):
+        if visits[step].node == planning.again:
+            made = set()
+        tries += _tries_at(planning, knowledge, visits[step], selections, made)
+    return tries
 
 
-def _tries_at(planning: Planning, knowledge: Knowledge, visit: Visit, selections: Mapping[str, str]) -> list[Try]:
-    """Return the try that leaving a visit's node is; none where neither the way nor a model depends on a selection."""
+def _tries_at(
+    planning: Planning, knowledge: Knowledge, visit: Visit, selections: Mapping[str, str], made: set[str]
+) -> list[Try]:
+    """Return the try that leaving a visit's node is, and add its selections to those made in the attempt.
+
+    None where neither the way nor a model depends on another selection.
+    """
     used: set[str | None] = set()
     for group in planning.graph.groups.get(visit.node, ()):
         if group.kind != "reward":
             models = [group.probability, *(branch.model for branch in group.branches)]
             used.update([group.selection], *(model.reads for model in models if isinstance(model, BoundModel)))
-    made = {label: choice for label, choice in selections.items() if label in used}
-    return [(_situation(planning, knowledge, visit.step), made)] if made else []
+    new = {label: choice for label, choice in selections.items() if label in used - made}
+    made.update(new)
+    return [(_situation(planning, knowledge, visit.step), new)] if new else []
 
 
 def _situation(planning: Planning, knowledge: Knowledge, step: int) -> Array:
     return situation_of(planning.graph, planning.informative, knowledge.at[step], knowledge.at[0])
+
+
+@contextmanager
+def _as_zero(parameters: Sequence[Parameter]) -> Iterator[None]:
+    """Let parameters be 0 in between."""
+    kept = [parameter.value for parameter in parameters]
+    try:
+        for parameter, value in zip(parameters, kept, strict=True):
+            parameter.value = np.zeros_like(value)
+        yield
+    finally:
+        for parameter, value in zip(parameters, kept, strict=True):
+            parameter.value = value
 
 
 def _ahead(tree: Tree) -> set[str]:

@@ -41,7 +41,11 @@ def checked_count(value: Any, place: str) -> int:
 
 def checked_number(value: Any, place: str) -> float:
     """Return a finite number of at least 0; raise InputError naming the place otherwise."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not 0 <= value < np.inf:
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, (int, float, np.integer, np.floating))
+        or not 0 <= value < 1e300
+    ):
         raise InputError(f"{place} is {value!r}; give a number of at least 0")
     return float(value)
 

@@ -15,8 +15,8 @@ from symgraph.progress import Progress
 from symgraph.slots import Array
 
 GROWTH = 1.5  # times the samples of the last fit from scratch at which one begins anew
-WARM_SHARE = 0.3  # of the steps from scratch that a warm start takes if a tenth of its samples is new
-LEAST_WARM = 60  # steps of a warm start, however little is new
+WARM_SHARE = 0.3  # of the steps from scratch that a warm start takes if at least a tenth of its samples is new
+LEAST_WARM = 60  # steps of a warm start, however little is new: ten until the rate is up, and time to come down again
 
 
 @dataclass
@@ -131,5 +131,7 @@ class Learner:
         steps = default_steps(len(x), max(sizes[1:-1], default=100))
         if schedule.warm:
             steps = max(LEAST_WARM, round(WARM_SHARE * min(1.0, 10 * schedule.news) * steps))
-        training = train(copies, inputs, targets, schedule.folds, loss, steps, rng, progress, decay, linear)
+        training = train(
+            copies, inputs, targets, schedule.folds, loss, steps, rng, progress, decay=decay, linear=linear
+        )
         return Memory(training.copies, *scaling), training

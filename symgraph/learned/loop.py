@@ -96,7 +96,7 @@ class OnlineLoop:
             attempts,
             seed,
             tuple(self._lessons.reads),
-            tuple(lesson.model for lesson in self._lessons.all.values() if hasattr(lesson.model, "certain")),
+            tuple(p for lesson in self._lessons.all.values() for p in getattr(lesson.model, "spreads", ())),
         )
         # How many episodes are taken over, and samples of each model then. Changed at once, so that an exception at any
         # moment leaves what can be gone on from.

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -94,9 +93,8 @@ class StochasticNetwork(LearnedModel):
         start: where a fit from scratch begins: "random" (default) weights, or "linear", the ridge regression that
             predicts best the samples that were left out: better where samples are few and inputs many, worse where
             outliers lie far from all others.
-        decay: λ ≥ 0 of weight decay: the mean network minimises mean square error + λ ‖weights‖² / N, both in standard
-            deviations, instead of stopping where samples that were left out are predicted best (0, the default). 1 is
-            better where samples are few and much of what they show is noise.
+        decay: λ ≥ 0 of weight decay: for each output the mean network minimises Σ error² + λ ‖weights‖², both in
+            standard deviations; 0 (default) leaves it to stopping early alone.
         samples_needed: with fewer, plans that need the network explore.
         resolution: {label: standard deviation, a number or one for each element} up to which an input is taken for a
             constant that carries noise, of which nothing is learned; 0 where left out [units of the inputs].
@@ -142,15 +140,10 @@ class StochasticNetwork(LearnedModel):
             return self._mean.parameters
         return (*self._mean.parameters, *self._error.parameters, self._error_scale)
 
-    @contextmanager
-    def certain(self) -> Iterator[None]:
-        """Let plans, in between, take what it predicts for exact: σ = 0; the spread of inputs is still passed on."""
-        scale = self._error_scale.value
-        self._error_scale.value = np.zeros_like(scale)
-        try:
-            yield
-        finally:
-            self._error_scale.value = scale
+    @property
+    def spreads(self) -> tuple[Parameter, ...]:
+        """The scale of σ."""
+        return () if self.error == "none" else (self._error_scale,)
 
     def propagate(self, inputs: Mapping[str, Gaussian]) -> dict[str, Gaussian]:
         """Return the Gaussians of what it writes, as expressions of its parameters."""

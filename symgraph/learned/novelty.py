@@ -35,9 +35,10 @@ def least_known(selection: str, choices: Sequence[str], situation: Array, tries:
     """Return the choices that have been tried least in situations like one.
 
     A try counts exp(-d²/2), with d its distance from the situation, each element in standard deviations over all tries:
-    the density of tries, as a Gaussian kernel estimates it. A skill that has been tried a hundred times with paste is
-    still unknown for water. An element that a try does not know counts as two independent draws would be expected to,
-    2 squared deviations; one that is not known in the situation, or that does not vary, says nothing.
+    the sum is the density of tries but for a factor. With many elements the nearest tries decide. A skill that has been
+    tried a hundred times with paste is still unknown for water. An element that a try does not know counts as two
+    independent draws would be expected to, 2 squared deviations; one that is not known in the situation, or that does
+    not vary, says nothing.
 
     Args:
         selection: the selection.
@@ -49,17 +50,16 @@ def least_known(selection: str, choices: Sequence[str], situation: Array, tries:
         return list(choices)
     made = [choices_made.get(selection) for _, choices_made in tries]
     seen = np.array([where for where, _ in tries])
-    largest = np.fmax.reduce(np.abs([*seen, situation]))  # passes over NaN
+    largest = np.fmax.reduce(np.abs(seen))  # passes over NaN
     unit = np.where(largest > 0.0, largest, 1.0)  # in which no square overflows
     sd = unit * np.ma.masked_invalid(seen / unit).std(axis=0).filled(0.0)
     tells = (sd > SMALLEST_SPREAD * unit) & ~np.isnan(situation)
     offsets = (seen[:, tells] - situation[tells]) / sd[tells]
     squares = np.where(np.isnan(offsets), 2.0, offsets**2).sum(axis=1)
+    # Logarithms tell tries apart however far they are; sorted, equal ones count the same to the last bit.
     counted = {
-        choice: float(
-            np.logaddexp.reduce([-square / 2 for one, square in zip(made, squares, strict=True) if one == choice])
-        )
+        choice: np.logaddexp.reduce(sorted(-q / 2 for one, q in zip(made, squares, strict=True) if one == choice))
         for choice in choices
-    }  # logarithms, which tell tries apart however far they all are
+    }
     least = min(counted.values())
-    return [choice for choice in choices if counted[choice] == least]
+    return [choice for choice in choices if counted[choice] <= least + 1e-9]

@@ -132,13 +132,14 @@ def train(
     steps: int,
     rng: np.random.Generator,
     progress: Progress,
+    *,
     decay: float = 0.0,
     linear: bool = False,
 ) -> Training:
     """Minimise a loss by Adam with a falling rate, all copies in one step, and keep the best weights on the way.
 
-    With a decay λ the loss is mean loss + λ ‖w‖² / N, the most probable weights under a Gaussian prior, and the last
-    weights are kept: what λ holds back need not be stopped early.
+    With a decay λ the loss of a copy is mean loss + λ ‖w‖² / (m N), with N samples and m outputs: for squares, the most
+    probable weights under a Gaussian prior.
 
     Gradients go back through the layers by hand: with few samples an automatic one costs several times the sums.
 
@@ -148,20 +149,22 @@ def train(
         targets: (N, m).
         folds: (N,) fold of each sample.
         loss: of each copy and sample.
-        steps: at most; fewer when the held-out loss no longer falls, unless weights decay.
+        steps: at most; fewer when the held-out loss no longer falls.
         rng: draws the samples of each step.
         progress: is told of the steps.
         decay: λ, of all weights but biases.
-        linear: whether the copies come from `begin_linear`: what only hands the linear function on does not decay.
+        linear: whether the copies come from `begin_linear`: what only hands the linear function on stays as it is. If
+            it could grow, slopes before it could shrink, and nothing would hold the function back.
 
     Source: Kingma & Ba, Adam, ICLR 2015.
     """
     torch = import_torch()
     n, held_out_copies = len(x), copies.count - 1
     inputs, wanted = (torch.from_numpy(np.asarray(a, dtype=np.float32)) for a in (x, targets))
-    learning = torch.ones((copies.count, n))
+    learns = np.ones((copies.count, n), dtype=np.float32)
     for k in range(held_out_copies):
-        learning[1 + k, torch.from_numpy(folds == k)] = 0.0
+        learns[1 + k, folds == k] = 0.0
+    learning = torch.from_numpy(learns)
     judged = np.flatnonzero(folds < held_out_copies)
     if len(judged) > MOST_SCORED:
         judged = np.sort(rng.choice(judged, MOST_SCORED, replace=False))
@@ -174,11 +177,13 @@ def train(
     )
     average, best, slope = flat.clone(), flat.clone(), torch.zeros_like(flat)
     tensors, averages, slopes = (_views(one, shapes) for one in (flat, average, slope))
-    pull = torch.zeros_like(flat)  # decay in the direction of each weight
-    for i, part in enumerate(_views(pull, shapes)[::2]):
-        part.fill_(2 * decay / n)
-        if linear and i:
-            part[:, : shapes[-1][-1], : shapes[-1][-1]] = 0.0
+    m = shapes[-1][-1]
+    rates, moves = torch.zeros_like(flat), torch.ones_like(flat)  # of decay; 0 for weights that stay
+    rate = 2 * decay / (m * learning.sum(1).clamp(min=1.0))
+    for layer, (decays, free) in enumerate(zip(_views(rates, shapes)[::2], _views(moves, shapes)[::2], strict=True)):
+        decays += rate[:, None, None]
+        if linear and layer:
+            free[:, :m, :m] = 0.0
     batch = min(n, max(32, COLUMNS // copies.count))
     order, at = rng.permutation(n), 0
     with _one_thread(), torch.no_grad():
@@ -191,20 +196,22 @@ def train(
             chosen = torch.from_numpy(order[at : at + batch])
             at += batch
             # Up within ten steps, then down along half a cosine.
-            rate = min(1.0, (step + 1) / 10) * 0.5 * (1 + math.cos(math.pi * step / steps))
-            optimizer.param_groups[0]["lr"] = LEARNING_RATE * rate
+            share = min(1.0, (step + 1) / 10) * 0.5 * (1 + math.cos(math.pi * step / steps))
+            optimizer.param_groups[0]["lr"] = LEARNING_RATE * share
             weight = learning[:, chosen]
             weight /= weight.sum(1, keepdim=True).clamp(min=1.0)
             _gradient(tensors, slopes, inputs[chosen], wanted[chosen], weight, loss)
             if decay:
-                slope.addcmul_(pull, flat)
+                slope.addcmul_(rates, flat)
+            if linear:
+                slope.mul_(moves)
             optimizer.step()
             average.lerp_(flat, 1 - AVERAGING)
             made = step + 1
             if made % EVERY == 0 or made == steps:
                 progress.update(made, steps)
                 now = scored.loss(averages, loss)
-                if decay or now < least:
+                if now < least:
                     least, least_step = now, made
                     best.copy_(average)
                 elif made - least_step > max(60, steps // 3):
@@ -220,14 +227,17 @@ def train(
 
 
 class _Scored:
-    """Held-out samples, those of each copy in rows of equal length, so that one pass judges all copies."""
+    """Held-out samples in a row for each copy, so that one pass judges all copies.
+
+    Rows are of equal length: in the shorter ones some samples stand twice, and count once.
+    """
 
     def __init__(self, rows: Sequence[npt.NDArray[np.intp]], inputs: torch.Tensor, wanted: torch.Tensor) -> None:
         torch = import_torch()
         longest = max(map(len, rows), default=0)
         index, share = np.zeros((len(rows), longest), dtype=np.int64), np.zeros((len(rows), longest), dtype=np.float32)
         for k, one in enumerate(rows):
-            index[k, : len(one)], share[k, : len(one)] = one, 1.0
+            index[k], share[k, : len(one)] = np.resize(one, longest), 1.0
         at = torch.from_numpy(index)
         self._share = torch.from_numpy(share / max(1.0, share.sum()))
         self._inputs, self._wanted = inputs[at], wanted[at]
