@@ -96,13 +96,14 @@ def rebuild(folder: Path, results: Path, begun: Collection[Run] = ()) -> None:
         numbers |= {int(place.name) for place in places if place.name.isdecimal()}
         for number in sorted(numbers):
             one = Run(condition, number, folder)
-            rows += one.rows() or fitting(one, old[condition.setup, condition.name, number])
+            rows += one.rows() or of_its_seed(one, old[condition.setup, condition.name, number])
     write(results, COLUMNS, rows)
 
 
-def fitting(one: Run, rows: list[dict[str, str]]) -> list[dict[str, str]]:
+def of_its_seed(one: Run, rows: list[dict[str, str]]) -> list[dict[str, str]]:
     """Return those rows of a run that its seed led to; say what is left out."""
-    kept = [row for row in rows if int(row["seed"]) in one.seeds]
+    seeds = one.seeds
+    kept = [row for row in rows if int(row["seed"]) in seeds]
     if len(kept) < len(rows):
         typer.echo(f"{one.condition.key}, run {one.number}: {len(rows) - len(kept)} rows of other seeds are dropped")
     return kept
