@@ -179,10 +179,26 @@ def test_settings_are_written_once(store, path):
         lambda: store.set_settings({"world": "cannon", "limit": math.nan}),
         sg.InputError,
         f"{path} already has settings",
-        "'world', 'rates'",
+        "others for 'world', 'rates': world is stored as 'pouring', given as 'cannon'; rates is stored as [0.5], given",
         "another path",
     )
     assert store.settings["world"] == "pouring"
+
+
+@pytest.mark.parametrize(
+    ("stored", "given", "words"),
+    [
+        ({"a": {"b": 1, "c": [1, 2]}}, {"a": {"b": 1, "c": [1, 3]}}, "a['c'][1] is stored as 2, given as 3."),
+        ({"a": [1, 2]}, {"a": [1, 2, "x"]}, "a[2] is stored as nothing, given as 'x'."),
+        ({"a": {"b": 1}}, {"a": None}, "a is stored as {'b': 1}, given as None."),
+        ({"a": {"b": 1, "c": 2}}, {"a": {"c": 2, "b": 1}}, "a is stored in the order 'b', 'c', given in the order 'c'"),
+        ({"a": "x" * 999}, {}, f"a is stored as '{'x' * 119} …, given as nothing."),
+    ],
+    ids=["element", "longer", "kind", "order", "long"],
+)
+def test_settings_that_differ_are_shown_where_they_do(store, stored, given, words):
+    store.set_settings(stored)
+    refuses(lambda: store.set_settings(given), sg.InputError, words)
 
 
 def test_an_old_store_goes_on_and_opening_changes_nothing(path):
@@ -383,24 +399,30 @@ def test_export_holds_every_visit(store, tmp_path):
 def test_export_of_nothing_has_the_columns_of_every_table(store, tmp_path):
     import pyarrow.parquet
 
-    assert store.export(tmp_path / "x") == 0
-    assert pyarrow.parquet.read_table(tmp_path / "x").schema.field("seed").type == "int64"
+    assert store.export(tmp_path / "x.parquet") == 0
+    assert pyarrow.parquet.read_table(tmp_path / "x.parquet").schema.field("seed").type == "int64"
 
 
 def test_export_refuses_what_it_cannot_write(store, tmp_path, monkeypatch):
     store.begin(0, "s", 0, {"x": [1.0], "x[0]": 2.0})
     refuses(
-        lambda: store.export(tmp_path / "x"), sg.InputError, "two labels lead to the column 'observed.x[0]': 'x[0]'"
+        lambda: store.export(tmp_path / "x.parquet"),
+        sg.InputError,
+        "two labels lead to the column 'observed.x[0]': 'x[0]'",
     )
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    refuses(lambda: store.export(tmp_path / "x"), sg.MissingExtraError, "pip install 'symgraph[learned]'")
-    assert not (tmp_path / "x").exists()
+    refuses(lambda: store.export(tmp_path / "x.parquet"), sg.MissingExtraError, "pip install 'symgraph[learned]'")
+    assert not (tmp_path / "x.parquet").exists()
 
 
 def test_export_names_paths_that_cannot_be(store, tmp_path):
     store.begin(0, "s", 0, {})
     refuses(lambda: store.export(None), sg.StorageError, "is no path of a file")
-    refuses(lambda: store.export(tmp_path / "none" / "x"), sg.StorageError, "cannot be written: No such file")
+    for name in ("run.csv", "run"):
+        words = "run", "the file will be in the format Parquet; give a name that ends in .parquet"
+        refuses(lambda name=name: store.export(tmp_path / name), sg.InputError, *words)
+    store.export(tmp_path / "RUN.PARQUET")
+    refuses(lambda: store.export(tmp_path / "none" / "x.parquet"), sg.StorageError, "cannot be written: No such file")
 
 
 # Speed

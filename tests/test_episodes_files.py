@@ -281,7 +281,7 @@ def test_foreign_files_are_refused_and_left_alone(tmp_path):
     execute(marked, "PRAGMA application_id = 77")
     before = {file: file.read_bytes() for file in (text, short, other, marked)}
     for file in (text, short):
-        both(file, "is damaged: file is not a database", "take another copy")
+        both(file, "is no SQLite file, or its first bytes are damaged; give the path of an episode store")
     for file in (other, marked):
         both(file, "is an SQLite database of another program, not an episode store; give another path")
     assert before == {file: file.read_bytes() for file in tmp_path.iterdir()}  # no lock files either
@@ -334,7 +334,7 @@ def test_contents_that_make_no_sense_are_refused(held, change):
 def test_episodes_and_settings_that_make_no_sense_are_refused(held, tmp_path):
     execute(held, "UPDATE episodes SET info = 'x', total = 'y'", "INSERT INTO settings VALUES (1, '3')")
     with EpisodeStore(held, read_only=True) as store:
-        for call in (store.episodes, lambda: store.settings, lambda: store.export(tmp_path / "x")):
+        for call in (store.episodes, lambda: store.settings, lambda: store.export(tmp_path / "x.parquet")):
             refuses(call, sg.StorageError, f"{held} is damaged", "is nothing that a store writes")
 
 

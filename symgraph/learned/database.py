@@ -266,7 +266,12 @@ class Database:
             code = getattr(error, "sqlite_errorcode", None)
             kind = None if code is None else code & 0xFF  # the rest are details
             what = str(error)
-            if kind in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_ERROR) or kind is None:
+            if kind == sqlite3.SQLITE_NOTADB:
+                raise StorageError(
+                    f"{self.path} is no SQLite file, or its first bytes are damaged; give the path of {self._what}, or "
+                    "take another copy of the file"
+                ) from error
+            if kind in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_ERROR) or kind is None:
                 raise self.damaged(what) from error
             remedy = {
                 sqlite3.SQLITE_FULL: "make room on the disk; what was stored before is there",

@@ -15,6 +15,7 @@ from symgraph.learned.records import (
     Episode,
     Value,
     Visit,
+    changes,
     checked_name,
     checked_names,
     checked_number,
@@ -31,6 +32,7 @@ from symgraph.learned.records import (
     values_text,
     visit_of,
 )
+from symgraph.learned.storage import checked_path
 from symgraph.learned.tables import Groups, write_table
 
 __all__ = ["Episode", "EpisodeStore", "Value", "Visit"]
@@ -118,13 +120,11 @@ class EpisodeStore:
                 connection.execute("INSERT INTO settings VALUES (1, ?)", (text,))
                 return
             before, now = self._decoded(mapping_of, row[0]), mapping_of(text)
-        # Compared as text, in which NaN equals NaN; a name that one of them lacks differs from every value.
-        told, asked = ({name: json_of({name: value}, "") for name, value in all_.items()} for all_ in (before, now))
-        changed = [name for name in {**told, **asked} if told.get(name) != asked.get(name)]
+        changed = changes(before, now)
         if changed:
             raise InputError(
-                f"{self._database.path} already has settings, with others for {names(changed)}; go on with those it "
-                "has, or give another path"
+                f"{self._database.path} already has settings, with others for {names(changed)}: "
+                f"{'; '.join(changed.values())}. Go on with those it has, or give another path"
             )
 
     def begin(
@@ -317,14 +317,22 @@ class EpisodeStore:
 
         Columns are `episode`, `setup`, `seed`, `status`, `total`, `step`, `parent`, `node` and `reward`, then
         `observed.label`, `action.label` and `selection.label`; the elements of an array are `observed.label[0]`,
-        `observed.label[1]` and so on. What a visit lacks is null. A file that was there is
-        replaced once all is written.
+        `observed.label[1]` and so on. What a visit lacks is null, also what was observed before it. Plans, settings,
+        and an episode's reason, seconds, info and times are left out. A file that was there is replaced once all is
+        written.
+
+        Args:
+            path: that ends in .parquet.
 
         Raises:
             StorageError: the file cannot be written.
-            InputError: two labels lead to one column.
+            InputError: a path that ends in something else, or two labels that lead to one column.
             MissingExtraError: pyarrow is not installed.
         """
+        if checked_path(path).suffix.lower() != ".parquet":
+            raise InputError(
+                f"path = {os.fspath(path)!r}: the file will be in the format Parquet; give a name that ends in .parquet"
+            )
         with self._database.reading() as connection:
             about = connection.execute("SELECT number, setup, seed, status, total FROM episodes").fetchall()
             rows = connection.execute(f"SELECT {VISIT_COLUMNS} FROM visits ORDER BY episode, step").fetchall()

@@ -15,12 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from symgraph.errors import InputError
+from symgraph.errors import InputError, names
 from symgraph.slots import Array
 
 Value = float | Array  # a scalar slot is a float, any other a 1-D array
 
 LARGEST = (1 << 63) - 1  # of the whole numbers that SQLite holds
+ABSENT = object()  # where one of two mappings has nothing
 
 
 @dataclass(frozen=True)
@@ -234,6 +235,40 @@ def json_of(given: Any, place: str) -> str:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{place}: {error}; leave it out") from None
+
+
+def changes(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, str]:
+    """Return {name: where it differs first, and what stands there} of two mappings that came from JSON.
+
+    They are compared as text, in which NaN equals NaN and the order of labels counts, as the columns of samples do.
+    """
+    found = {}
+    for name in dict.fromkeys([*stored, *given]):
+        told, asked = stored.get(name, ABSENT), given.get(name, ABSENT)
+        if _text(told) != _text(asked):
+            found[name] = _difference(told, asked, name)
+    return found
+
+
+def _difference(stored: Any, given: Any, place: str) -> str:
+    if type(stored) is type(given) and isinstance(stored, (dict, list)):
+        left, right = (one if isinstance(one, dict) else dict(enumerate(one)) for one in (stored, given))
+        for key in [*left, *right]:
+            told, asked = left.get(key, ABSENT), right.get(key, ABSENT)
+            if _text(told) != _text(asked):
+                return _difference(told, asked, f"{place}[{key!r}]")
+        # A mapping: a list would differ at one of its places.
+        return f"{place} is stored in the order {names(map(str, left))}, given in the order {names(map(str, right))}"
+    told, asked = ("nothing" if one is ABSENT else _cut(repr(one)) for one in (stored, given))
+    return f"{place} is stored as {told}, given as {asked}"
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= 120 else f"{text[:120]} …"
+
+
+def _text(value: Any) -> str | None:
+    return None if value is ABSENT else json.dumps(value)
 
 
 def _plain(given: Any, place: str) -> Any:
