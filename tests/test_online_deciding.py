@@ -159,9 +159,12 @@ def test_exploration_falls_linearly():
         assert [now.selections, now.actions, now.noise] == pytest.approx([0.5 * share, 0.4 * share, 0.1 * share])
         assert [now.at(0).selections, now.at(1).selections] == pytest.approx([0.5 * share, 0.0])
     assert Exploration(episodes=np.int64(3)) == Exploration(episodes=3)
-    for wrong in ({"selections": 1.5}, {"actions": -0.1}, {"noise": math.nan}, {"episodes": "many"}, {"noise": True}):
-        ((name, value),) = wrong.items()
-        refuses(lambda wrong=wrong: Exploration(**wrong), sg.InputError, f"{name} = {value!r}", "give a number from 0")
+    for name, value in (("selections", 1.5), ("actions", -0.1), ("noise", math.nan), ("noise", True)):
+        words = f"{name} = {value!r}; give a number from 0 to 1"
+        refuses(lambda name=name, value=value: Exploration(**{name: value}), sg.InputError, words)
+    for value in (-1, "many"):
+        words = f"episodes = {value!r}; give a number of at least 0"
+        refuses(lambda value=value: Exploration(episodes=value), sg.InputError, words)
 
 
 def test_a_loop_goes_on_with_a_plan_that_was_noted(tmp_path):

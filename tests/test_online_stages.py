@@ -61,14 +61,18 @@ def test_rewards_are_shaped_through_what_is_given(tmp_path):
             paid = 5.0 if report.number % 4 < 2 and report.number < 8 else 0.0
             assert report.total == pytest.approx(paid - (report.known["y"] - 1.0) ** 2, rel=1e-12)
         assert one.perform(world_at(0.1), 0, {"bonus": [9.0, 0.0]}).selections == {"skill": "near"}
-        refuses(lambda: one.perform(world_at(0.1), 0), sg.InputError, "'bonus'")
+        words = "state 'bonus' is missing at the start: node 'aim', reward: ", "over as given="
+        refuses(lambda: one.perform(world_at(0.1), 0), sg.InputError, *words)
+        refuses(lambda: one.plan({"s": 0.1}), sg.InputError, "state 'bonus' is missing")
+        assert one.plan({"s": 0.1, "bonus": [9.0, 0.0]}).selections == {"skill": "near"}
 
 
 def test_what_is_given_must_be_states(tmp_path):
     for name, given, words in (
         ("typing error", {"bonos": [0.0, 0.0]}, "given: 'bonos' is no state; did you mean 'bonus'?"),
         ("action", {"u": 0.0}, "given: 'u' is no state"),
-        ("nothing", lambda episode: None, "given = None; give {label: value}"),
+        ("nothing", lambda episode: None, "stage 'toy': given returned None for its episode 0; return {label: value}"),
+        ("observed", {"bonus": [0.0, 0.0], "s": 0.1}, "given: 's' is what the world's reset observes; leave it out"),
         ("size", {"bonus": 1.0}, "given: 'bonus' = 1.0; the slot takes 2 finite numbers"),
         ("NaN", {"bonus": [0.0, np.nan]}, "given: 'bonus' = [0.0, nan]; the slot takes 2 finite numbers"),
         ("words", {"bonus": ["a", "b"]}, "given 'bonus' = ['a', 'b'] is not a number or an array of numbers"),
@@ -77,6 +81,13 @@ def test_what_is_given_must_be_states(tmp_path):
             refuses(lambda one=one: list(one), sg.InputError, words)
             assert len(one.store) == 0
     refuses(lambda: Stage("toy", world_at(0.1), 1, NOTHING, [1.0]), sg.InputError, "'toy': given is [1.0]")
+    for given in (dict, lambda episode, *more: {}):
+        Stage("toy", world_at(0.1), 1, NOTHING, given)
+    for given in (lambda: NOTHING, lambda episode, bonus: {}):
+        words = "'toy': given is a function that cannot be called with the stage's episode alone"
+        refuses(lambda given=given: Stage("toy", world_at(0.1), 1, NOTHING, given), sg.InputError, words)
+    with loop(tmp_path / "perform", shaped_graph(), world_at(0.1)) as one:
+        refuses(lambda: one.perform(world_at(0.1), 0, 3.0), sg.InputError, "given = 3.0; give {label: value}")
 
 
 def test_more_episodes_in_the_last_stage_go_on_and_other_stages_are_refused(tmp_path):
@@ -120,14 +131,18 @@ def test_other_settings_are_refused(tmp_path, change, changed):
         f"{changed!r}",
     )
     other = kick_graph(Spy({"s": 1, "u": 1}, {"y": 1}, "near"))
-    refuses(
-        lambda: loop(tmp_path, other, kicking(), 2), sg.InputError, "already has settings, with others for 'learned'"
-    )
+    words = "others for 'learned': learned['near']['reads'] is stored in the order 'u', 's', given in the order 's'"
+    refuses(lambda: loop(tmp_path, other, kicking(), 2), sg.InputError, words)
+    changed = kick_graph()
+    changed.groups["aim"][0].branches[0].model.learner.settings["decay"] = 0.5
+    words = "with others for 'learned': learned['near']['decay'] is stored as nothing, given as 0.5. Go on with those"
+    refuses(lambda: loop(tmp_path, changed, kicking(), 2), sg.InputError, words)
     # "aim" is where the graph starts, so it is decided there anyway
     with loop(tmp_path, kick_graph(), kicking(), 1, decisions=["aim"]):
         pass
     more = kick_graph(w=sg.State())
-    refuses(lambda: loop(tmp_path, more, kicking(), 2), sg.InputError, "already has settings, with others for 'slots'")
+    words = "has settings, with others for 'slots': slots['w'] is stored as nothing, given as", "State(size=1"
+    refuses(lambda: loop(tmp_path, more, kicking(), 2), sg.InputError, *words)
 
 
 def test_two_loops_in_one_folder_are_refused(tmp_path):
@@ -169,6 +184,9 @@ def test_stages_and_folders_that_do_not_fit_are_refused(tmp_path):
     stage = Stage("toy", kicking(), 1)
     for stages in (stage, [], [stage, "toy"]):
         refuses(lambda stages=stages: OnlineLoop(kick_graph(), stages, tmp_path), sg.InputError, "give a list of Stage")
+    twins = [stage, Stage("other", kicking(), 1), Stage("toy", kicking(), 2)]
+    words = "stages[0] and stages[2] are both named 'toy'; give each a name of its own"
+    refuses(lambda: OnlineLoop(kick_graph(), twins, tmp_path), sg.InputError, words)
     (tmp_path / "file").touch()
     refuses(
         lambda: OnlineLoop(kick_graph(), [stage], tmp_path / "file"),

@@ -43,6 +43,7 @@ class Execution:
         number: of the episode.
         past: visits of this episode that were stored before: the world is brought back to where it was by doing the
             same again.
+        needed: {state: place that reads it} of those without which nothing can be planned at the start.
 
     Attributes:
         visits: in the order in which nodes were reached.
@@ -50,13 +51,20 @@ class Execution:
     """
 
     def __init__(
-        self, graph: Graph, world: World, knowledge: Knowledge, number: int, past: Sequence[Visit] = ()
+        self,
+        graph: Graph,
+        world: World,
+        knowledge: Knowledge,
+        number: int,
+        past: Sequence[Visit] = (),
+        needed: Mapping[str, str] | None = None,
     ) -> None:
         self._graph = graph
         self._world = world
         self._knowledge = knowledge
         self._number = number
         self._past = list(past)
+        self._needed = needed or {}
         self.visits: list[Visit] = []
         self.seconds = 0.0
 
@@ -72,7 +80,7 @@ class Execution:
 
         Args:
             seed: of the world.
-            given: {label: value} of states that the world does not observe.
+            given: {label: value} of states that the world's reset does not observe.
             decide: returns the actions and selections with which a visit's node is left.
             reached: called with the visits that an executed node has led to, and whether they are new.
             goes_on: whether the world is asked to leave a visit's node; called once for each visit.
@@ -81,15 +89,20 @@ class Execution:
             WorldFailed: the world raised, on the way, an exception with an attribute `observed`. Any other comes out
                 as it is: it may be a mistake in a program.
             Diverged: the world does not lead to the past again.
-            InputError: the world observed what makes no sense.
+            InputError: the world observed what makes no sense, or lacks what is needed.
         """
         start = self._graph.start
         observed = self._timed(lambda: self._world.reset(seed))
         if not isinstance(observed, Mapping):
             raise InputError(f"node {start!r}: the world's reset returned {shown(observed)}; return {{label: value}}")
-        self._arrive(
-            None, [self._visit(0, None, start, {**observed, **self._checked_given(given)}, ({}, {}), 0.0)], reached
-        )
+        known = {**observed, **self._checked_given(given, observed)}
+        missing = [label for label in self._needed if label not in known]
+        if missing and not self._past:
+            raise InputError(
+                f"state {missing[0]!r} is missing at the start: {self._needed[missing[0]]} reads it; let the world's "
+                f"reset return it, or hand it over as given=, of Stage or of perform. Missing in all: {names(missing)}"
+            )
+        self._arrive(None, [self._visit(0, None, start, known, ({}, {}), 0.0)], reached)
         waiting = deque(self.visits)
         while waiting:
             visit = waiting.popleft()
@@ -158,13 +171,15 @@ class Execution:
                 f"{f' with {chosen}' if chosen else ''}; it can lead to {names(ways)}"
             )
 
-    def _checked_given(self, given: Any) -> Mapping[str, Any]:
+    def _checked_given(self, given: Any, observed: Mapping[str, Any]) -> Mapping[str, Any]:
         if not isinstance(given, Mapping):
             raise InputError(f"given = {shown(given)}; give {{label: value}}")
         states = self._graph.states()
         for label, value in given.items():
             if label not in states:
                 raise InputError(f"given: {label!r} is no state{did_you_mean(label, states)} States: {names(states)}")
+            if label in observed:
+                raise InputError(f"given: {label!r} is what the world's reset observes; leave it out of one of them")
             if np.size(value) != states[label].size or not np.isfinite(checked_value(value, f"given {label!r}")).all():
                 raise InputError(
                     f"given: {label!r} = {shown(value)}; the slot takes {states[label].size} finite numbers, give those"
@@ -175,7 +190,10 @@ class Execution:
         self, step: int, parent: Visit | None, node: str, observed: Mapping[str, Any], decision: Decision, due: float
     ) -> Visit:
         at = None if parent is None else parent.step
-        visit = checked_visit(Visit(self._number, step, at, node, dict(observed), *decision, 0.0))
+        try:
+            visit = checked_visit(Visit(self._number, step, at, node, dict(observed), *decision, 0.0))
+        except InputError as error:
+            raise InputError(f"node {node!r}: {error}") from None
         self._knowledge.arrive(visit, parent)
         return replace(visit, reward=due + self._knowledge.reward(visit))
 

@@ -77,6 +77,7 @@ class OnlineLoop:
     ) -> None:
         if isinstance(stages, Stage) or not stages or not all(isinstance(stage, Stage) for stage in stages):
             raise InputError(f"stages = {stages!r}; give a list of Stage")
+        _check_names([stage.name for stage in stages])
         self.graph = graph
         self.stages = tuple(stages)
         self.folder = checked_path(folder)
@@ -168,11 +169,11 @@ class OnlineLoop:
         Args:
             world: where.
             seed: of the world.
-            given: {label: value} of states that it does not observe.
+            given: {label: value} of states that its reset does not observe, as in `Stage`.
         """
         knowledge = self._knowledge()
         decider = Decider(self._planning, knowledge, 0, Exploration(episodes=0).at(0), self._past.starts(0, None))
-        execution = Execution(self.graph, world, knowledge, 0)
+        execution = Execution(self.graph, world, knowledge, 0, needed=self._needed)
         status, reason = "done", ""
         try:
             execution.run(
@@ -206,7 +207,7 @@ class OnlineLoop:
         self._catch_up(number)
         past, plans = self.store.visits(number), self.store.plans(number)
         knowledge = self._knowledge()
-        execution = Execution(self.graph, stage.world, knowledge, number, past)
+        execution = Execution(self.graph, stage.world, knowledge, number, past, self._needed)
         decider = Decider(
             self._planning,
             knowledge,
@@ -303,6 +304,21 @@ class OnlineLoop:
 
     def _knowledge(self) -> Knowledge:
         return Knowledge(self.graph, self._models, self.decisions)
+
+    @property
+    def _needed(self) -> dict[str, str]:
+        """{state: place that reads it} of those that every episode must begin with."""
+        return self._planning.objectives[self.graph.start].tree.needed_states
+
+
+def _check_names(stages: Sequence[str]) -> None:
+    """Raise InputError where two stages have one name: nobody could tell their episodes apart."""
+    for i, name in enumerate(stages):
+        if name in stages[:i]:
+            raise InputError(
+                f"stages[{stages.index(name)}] and stages[{i}] are both named {name!r}; give each a name of its own, "
+                f"under which its episodes are stored"
+            )
 
 
 def _checked_nodes(graph: Graph, decisions: Any, again: Any) -> list[str]:

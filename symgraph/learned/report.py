@@ -57,6 +57,7 @@ class EpisodeReport:
 
     def __str__(self) -> str:
         chosen = ", ".join(f"{label} = {choice}" for label, choice in self.selections.items())
-        parts = [f"{self.setup} {self.number}", chosen, f"return {self.total:.3g}", self.explored]
-        parts += ["" if self.status == "done" else f"{self.status}: {self.reason}"]
+        # What an episode that broke off was paid until then would pass for what it is worth.
+        end = f"return {self.total:.3g}" if self.status == "done" else f"{self.status}: {self.reason}"
+        parts = [f"{self.setup} {self.number}", chosen, end, self.explored]
         return "; ".join(part for part in parts if part)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -10,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from symgraph.errors import InputError
+from symgraph.learned.records import shown
 
 
 class World(Protocol):
@@ -52,7 +54,7 @@ class Exploration:
         actions: probability that its actions are drawn from their whole range, in the first episode.
         noise: standard deviation of what is added to actions that are not drawn, as a share of their range, in the
             first episode.
-        episodes: after how many nothing is tried any more.
+        episodes: after how many nothing is tried any more; 0 to try nothing at all.
 
     Raises:
         InputError: a number outside its range.
@@ -67,7 +69,8 @@ class Exploration:
         for name, most in (("selections", 1.0), ("actions", 1.0), ("noise", 1.0), ("episodes", math.inf)):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float, np.integer)) or not 0 <= value <= most:
-                raise InputError(f"Exploration: {name} = {value!r}; give a number from 0 to {most:g}")
+                wanted = "of at least 0" if math.isinf(most) else f"from 0 to {most:g}"
+                raise InputError(f"Exploration: {name} = {value!r}; give a number {wanted}")
 
     def at(self, episode: int) -> Exploration:
         """Return how much is tried in an episode, from 0 on, and in no other."""
@@ -80,12 +83,13 @@ class Stage:
     """A part of what is to be learned from: so many episodes in one world.
 
     Args:
-        name: under which its episodes are stored.
+        name: under which its episodes are stored; no two stages of a loop share one.
         world: where they happen, see `World`.
         episodes: how many.
-        explore: how much is tried; counts the episodes of this stage.
-        given: {label: value} of states that the world does not observe, or a function of the stage's episode, from 0
-            on, that returns it: reward shaping gives, say, a bonus that ends after ten episodes.
+        explore: how much is tried, `Exploration()` if left out, which draws nearly everything at first; nothing
+            with `Exploration(episodes=0)`. Counts the episodes of this stage.
+        given: {label: value} of states that the world's `reset` does not observe, or a function of the stage's episode,
+            from 0 on, that returns it: reward shaping gives, say, a bonus that ends after ten episodes.
 
     Raises:
         InputError: an argument that does not fit.
@@ -111,9 +115,33 @@ class Stage:
             raise InputError(
                 f"stage {self.name!r}: given is {self.given!r}; give {{label: value}}, or a function of it"
             )
+        if callable(self.given) and not _takes_episode(self.given):
+            raise InputError(
+                f"stage {self.name!r}: given is a function that cannot be called with the stage's episode alone; give "
+                f"one of one argument, or {{label: value}}"
+            )
         if not isinstance(self.explore, Exploration):
             raise InputError(f"stage {self.name!r}: explore is {self.explore!r}; give an Exploration")
 
     def given_at(self, episode: int) -> Mapping[str, Any]:
         """Return the states that are given in an episode of this stage."""
-        return self.given(episode) if callable(self.given) else self.given
+        if not callable(self.given):
+            return self.given
+        given = self.given(episode)
+        if not isinstance(given, Mapping):
+            raise InputError(
+                f"stage {self.name!r}: given returned {shown(given)} for its episode {episode}; return {{label: value}}"
+            )
+        return given
+
+
+def _takes_episode(function: Callable[..., Any]) -> bool:
+    try:
+        signature = inspect.signature(function)
+    except ValueError:  # a builtin that tells nobody what it takes
+        return True
+    try:
+        signature.bind(0)
+    except TypeError:
+        return False
+    return True
