@@ -3,11 +3,11 @@
 import casadi as ca
 import numpy as np
 import pytest
-from online_worlds import NOTHING, Scripted, Spy, kick_graph, kicking, loop
+from online_worlds import NOTHING, Scripted, Spy, kick_graph, kicking, loop, networks
 from small_tasks import refuses
 
 import symgraph as sg
-from symgraph.learned import BranchNetwork, Exploration
+from symgraph.learned import BranchNetwork, Exploration, StochasticNetwork
 
 DRAWN = Exploration(1.0, 1.0, 0.0, episodes=1e9)
 
@@ -244,6 +244,23 @@ def test_a_file_that_is_ahead_of_its_episodes_is_fitted_anew(tmp_path):
     refuses(
         lambda: loop(tmp_path, kick_graph(None, elsewhere), kicking(), 6), sg.InputError, "has seen 5 samples", "know 4"
     )
+
+
+def test_a_model_file_that_is_damaged_may_be_deleted(tmp_path):
+    with loop(tmp_path, kick_graph(*networks()), kicking(), 4, DRAWN) as one:
+        list(one)
+        counts = {name: lesson.model.samples for name, lesson in one._lessons.all.items()}
+    file = tmp_path / "far.safetensors"
+    file.write_bytes(file.read_bytes()[:-9])
+    words = f"{file}: ", "it was cut off or added to; delete the file, and the loop fits the model to its episodes"
+    refuses(lambda: loop(tmp_path, kick_graph(*networks()), kicking(), 4), sg.StorageError, *words)
+    StochasticNetwork({"u": 1, "s": 1}, {"y": 1}, (2,), name="far").save(file)
+    words = "holds a model with hidden = (2,)", "make it with the same settings"
+    refuses(lambda: loop(tmp_path, kick_graph(*networks()), kicking(), 4), sg.StorageError, *words)
+    file.unlink()
+    with loop(tmp_path, kick_graph(*networks()), kicking(), 4) as one:
+        assert {name: lesson.model.samples for name, lesson in one._lessons.all.items()} == counts
+    assert file.exists()
 
 
 def test_a_reward_that_was_learned_before_is_used_as_it_is(tmp_path):

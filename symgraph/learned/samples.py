@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from symgraph.binding import BoundModel
-from symgraph.errors import InputError, did_you_mean, names
+from symgraph.errors import InputError, StorageError, did_you_mean, names
 from symgraph.graph import Branch, Graph, Group
 from symgraph.learned.branches import BranchNetwork
 from symgraph.learned.knowledge import Knowledge, Known, branches_to, column_of
 from symgraph.learned.records import Visit
+from symgraph.learned.storage import REMEDY
 from symgraph.slots import Array
 
 # What a model that can be fitted must have beside `fit`, `reads`, `writes` and `propagate`.
@@ -94,10 +95,21 @@ class Lessons:
         self.reads = [label for label in dict.fromkeys(reads) if label in graph.states()]
 
     def restore(self) -> None:
-        """Take over the models that the folder holds."""
+        """Take over the models that the folder holds.
+
+        Raises:
+            StorageError: a file cannot be read, is damaged, or holds something else.
+        """
         for name, lesson in self.all.items():
-            if self.file_of(name).exists():
+            if not self.file_of(name).exists():
+                continue
+            try:
                 lesson.model.restore(self.file_of(name))
+            except StorageError as error:
+                what, damaged, _ = str(error).partition(f"; {REMEDY}")
+                if not damaged:
+                    raise
+                raise StorageError(f"{what}; delete the file, and the loop fits the model to its episodes") from None
 
     def check_seen(self) -> None:
         """Fit anew the models whose file has seen more samples than there are; raise InputError where others have.
