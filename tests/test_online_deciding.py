@@ -152,12 +152,13 @@ def test_without_episodes_nothing_is_explored(tmp_path):
     np.testing.assert_array_equal(actions, planned)
 
 
-def test_exploration_falls_linearly():
+def test_actions_come_closer_to_plans_and_selections_end_at_once():
     explore = Exploration(0.5, 0.4, 0.1, episodes=20)
     for episode, share in ((0, 1.0), (5, 0.75), (19, 0.05), (20, 0.0), (1000, 0.0)):
         now = explore.at(episode)
-        assert [now.selections, now.actions, now.noise] == pytest.approx([0.5 * share, 0.4 * share, 0.1 * share])
-        assert [now.at(0).selections, now.at(1).selections] == pytest.approx([0.5 * share, 0.0])
+        assert [now.actions, now.noise] == pytest.approx([0.4 * share, 0.1 * share])
+        assert now.selections == (0.5 if episode < 20 else 0.0)
+        assert [now.at(0).selections, now.at(1).selections] == [now.selections, 0.0]
     assert Exploration(episodes=np.int64(3)) == Exploration(episodes=3)
     for name, value in (("selections", 1.5), ("actions", -0.1), ("noise", math.nan), ("noise", True)):
         words = f"{name} = {value!r}; give a number from 0 to 1"

@@ -48,8 +48,8 @@ class FitReport:
         samples: how many there were.
         warm: whether it went on from the weights of the fit before.
         steps: of the mean network and of the error network.
-        rmse: (m,) root mean square error on samples that were left out, which also decided when to stop [units of the
-            outputs].
+        rmse: (m,) root mean square error on samples that were left out, which without decay also decided when to stop
+            [units of the outputs].
         seconds: wall time [s].
     """
 
@@ -93,8 +93,8 @@ class StochasticNetwork(LearnedModel):
         start: where a fit from scratch begins: "random" (default) weights, or "linear", the ridge regression that
             predicts best the samples that were left out: better where samples are few and inputs many, worse where
             outliers lie far from all others.
-        decay: λ ≥ 0 of weight decay: for each output the mean network minimises Σ error² + λ ‖weights‖², both in
-            standard deviations; 0 (default) leaves it to stopping early alone.
+        decay: λ of weight decay: for each output the mean network minimises Σ error² + λ ‖weights‖², both in standard
+            deviations, and does not stop early; 0 (default): it stops where held-out samples are predicted best.
         samples_needed: with fewer, plans that need the network explore.
         resolution: {label: standard deviation, a number or one for each element} up to which an input is taken for a
             constant that carries noise, of which nothing is learned; 0 where left out [units of the inputs].

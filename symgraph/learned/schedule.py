@@ -42,25 +42,27 @@ class World(Protocol):
 
 @dataclass(frozen=True)
 class Exploration:
-    """How much is tried beside what is planned: falls linearly from the first episode to none.
+    """How much is tried beside what is planned, in the first episodes.
 
-    Beside it, `solve` explores by itself while a model has too few samples.
+    Actions come closer and closer to plans. Selections do not: a choice that looks bad is learned well only by tries
+    that are as good as can be, and those come last. Beside that, `solve` explores by itself while a model has too few
+    samples.
 
     Args:
-        selections: probability that an attempt's selections are drawn instead of planned, in the first episode. What is
-            drawn is the choice known least: the one with the lowest density of tries, of all stages, in the situation.
-            Situations are told apart by those states that learned models read and that are known where an episode
-            starts. The rest is planned as if learned models were certain.
-        actions: probability that its actions are drawn from their whole range, in the first episode.
+        selections: probability that an attempt's selections are drawn instead of planned. What is drawn is the choice
+            known least: the one with the lowest density of tries, of all stages, in the situation. Situations are told
+            apart by those states that learned models read and that are known where an episode starts. The rest is
+            planned as if learned models were certain.
+        actions: probability that its actions are drawn from their whole range, in the first episode; falls linearly.
         noise: standard deviation of what is added to actions that are not drawn, as a share of their range, in the
-            first episode.
+            first episode; falls linearly.
         episodes: after how many nothing is tried any more; 0 to try nothing at all.
 
     Raises:
         InputError: a number outside its range.
     """
 
-    selections: float = 1.0
+    selections: float = 0.8
     actions: float = 1.0
     noise: float = 0.1
     episodes: int = 50
@@ -75,7 +77,7 @@ class Exploration:
     def at(self, episode: int) -> Exploration:
         """Return how much is tried in an episode, from 0 on, and in no other."""
         share = max(0.0, 1.0 - episode / self.episodes) if self.episodes else 0.0
-        return Exploration(self.selections * share, self.actions * share, self.noise * share, 1)
+        return Exploration(self.selections if share else 0.0, self.actions * share, self.noise * share, 1)
 
 
 @dataclass(frozen=True)

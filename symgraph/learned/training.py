@@ -111,7 +111,7 @@ class Training:
     """What came of a training.
 
     Attributes:
-        copies: the weights where the held-out loss was least.
+        copies: the weights where the held-out loss was least, with decay the last.
         outputs: (N, m) of the copies that had not seen the sample, NaN where every copy had.
         loss: the mean held-out loss there.
         steps: how many were made.
@@ -139,7 +139,7 @@ def train(
     """Minimise a loss by Adam with a falling rate, all copies in one step, and keep the best weights on the way.
 
     With a decay λ the loss of a copy is mean loss + λ ‖w‖² / (m N), with N samples and m outputs: for squares, the most
-    probable weights under a Gaussian prior.
+    probable weights under a Gaussian prior. The last weights are kept then: λ is what keeps noise out of them.
 
     Gradients go back through the layers by hand: with few samples an automatic one costs several times the sums.
 
@@ -149,7 +149,7 @@ def train(
         targets: (N, m).
         folds: (N,) fold of each sample.
         loss: of each copy and sample.
-        steps: at most; fewer when the held-out loss no longer falls.
+        steps: at most; without decay fewer when the held-out loss no longer falls.
         rng: draws the samples of each step.
         progress: is told of the steps.
         decay: λ, of all weights but biases.
@@ -211,7 +211,7 @@ def train(
             if made % EVERY == 0 or made == steps:
                 progress.update(made, steps)
                 now = scored.loss(averages, loss)
-                if now < least:
+                if decay or now < least:
                     least, least_step = now, made
                     best.copy_(average)
                 elif made - least_step > max(60, steps // 3):
