@@ -234,15 +234,15 @@ def test_a_file_that_is_ahead_of_its_episodes_is_fitted_anew(tmp_path):
     with loop(tmp_path, kick_graph(), kicking(), 6, Exploration(1.0, 1.0, 0.0, episodes=6)) as one:
         list(one)
     (tmp_path / "far.safetensors").write_text("5")
-    (tmp_path / "near.safetensors").write_text("2")
+    (tmp_path / "near.safetensors").write_text("3")
     with loop(tmp_path, kick_graph(), kicking(), 6, Exploration(1.0, 1.0, 0.0, episodes=6)) as one:
         fits = {name: [len(x) for x, _, _ in lesson.model.fits] for name, lesson in one._lessons.all.items()}
-    assert fits == {"far": [4], "near": []}
+    assert fits == {"far": [3], "near": []}
     (tmp_path / "far.safetensors").unlink()
     elsewhere = Spy({"u": 1, "s": 1}, {"y": 1}, "far")
     elsewhere.samples = 5
     refuses(
-        lambda: loop(tmp_path, kick_graph(None, elsewhere), kicking(), 6), sg.InputError, "has seen 5 samples", "know 4"
+        lambda: loop(tmp_path, kick_graph(None, elsewhere), kicking(), 6), sg.InputError, "has seen 5 samples", "know 3"
     )
 
 
