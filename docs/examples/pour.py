@@ -8,7 +8,8 @@ like paste. It is to pour 55 of them into another container. It can *tip* its co
 of Yamaguchi & Atkeson, *Differential Dynamic Programming for Graph-Structured Dynamical Systems*, Humanoids 2016.
 
 ``make pour`` runs this file: about four minutes for 80 episodes. Other tasks are options, such as
-``make pour ARGS="--material vsc --mouth 0.13"``; ``make pour ARGS=--help`` lists them.
+``make pour ARGS="--material vsc --mouth 0.13"``; ``make pour ARGS=--help`` lists them. It prints the command that
+goes on with it where it was stopped.
 """
 
 # %%
@@ -19,6 +20,10 @@ of Yamaguchi & Atkeson, *Differential Dynamic Programming for Graph-Structured D
 
 import enum
 import itertools
+import json
+import os
+import shlex
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -27,11 +32,13 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from typer import Option
 
 import symgraph as sg
 from models import pouring
 from sims.pouring import MATERIALS, PouringWorld
-from sims.pouring.rendering import FilmedWorld, write_video
+from sims.pouring.behaviour import SPHERE_AMOUNT, SPILL_AMOUNT
+from sims.pouring.rendering import RecordedWorld, write_video
 
 SETUPS = {
     "general": {"material": list(MATERIALS), "mouth": (0.11, 0.25), "target": 0.3},
@@ -58,64 +65,87 @@ EXPLORED = 60  # episodes in which it tries something beside its plans, less oft
 # up to four times in an episode.
 
 
-def loop_in(world, name, episodes, seed, folder):
-    graph = pouring.graph(*pouring.networks())
+def loop_in(world, name, options, folder):
+    explore = sg.learned.Exploration(episodes=EXPLORED, **pouring.EXPLORATION)
     return sg.learned.OnlineLoop(
-        graph,
-        [sg.learned.Stage(name, world, episodes, sg.learned.Exploration(episodes=EXPLORED, **pouring.EXPLORATION))],
+        pouring.graph(*pouring.networks()),
+        [sg.learned.Stage(name, world, options["episodes"], explore)],
         folder,
         **pouring.TRIALS,
         limits=pouring.LIMITS,
         optimizer=sg.Lbfgs(starts=8, iterations=60),
-        seed=seed,
+        seed=options["seed"],
     )
 
 
 # %%
 # What it tells
 # -------------
+# A line for each episode, with the skill of each attempt. The returns of the attempts add up.
 
-HEADS = ["material", "mouth", "skill", "attempts", "poured / target", "spilled", "return"]
-WIDTHS = [8, 5, 5, 8, 15, 7, 8]
+COLUMNS = {"material": 8, "mouth": 5, "poured": 7, "spilled": 7, "return": 7}
+WHY = {"": "", "drawn": "*", "exploring": "?"}  # an attempt was not the best plan
 
 
 def aligned(cells):
-    return "  ".join(f"{cell:>{width}}" for cell, width in zip(cells, WIDTHS, strict=True))
+    return "  ".join(f"{cell:>{width}}" for cell, width in zip(cells, COLUMNS.values(), strict=True))
 
 
 def told(episode):
     if episode.status != "done":
         return f"{episode.status}: {episode.reason}"
-    seen = episode.known
-    return aligned(
-        [
-            name_of(seen["material"]),
-            f"{seen['mouth']:.2f}",
-            episode.selections["skill"],
-            f"{episode.attempts}",
-            f"{seen['target'] - seen['target_change'] + seen['poured_change']:.3f} / {seen['target']:.3f}",
-            f"{(seen['spilled'] + seen['spilled_change']) / 0.1:.0f}",
-            f"{episode.total:.2f}",
-        ]
-    )
+    seen, name = episode.known, nearest(episode.known["material"])
+    material = name if np.allclose(MATERIALS[name].features, seen["material"]) else f"~{name}"
+    poured, target = (seen["poured"] + seen["poured_change"]) / SPHERE_AMOUNT, np.ceil(seen["target"] / SPHERE_AMOUNT)
+    spilled = (seen["spilled"] + seen["spilled_change"]) / SPILL_AMOUNT
+    amounts = f"{poured:.0f}/{target:.0f}", f"{spilled:.0f}"
+    return aligned([material, f"{seen['mouth']:.2f}", *amounts, f"{episode.total:z.2f}"])
 
 
-def name_of(features):
-    name = min(MATERIALS, key=lambda one: np.abs(MATERIALS[one].features - features).sum())
-    return name if np.allclose(MATERIALS[name].features, features) else f"near {name}"
+def nearest(features, materials=MATERIALS):
+    return min(materials, key=lambda one: np.abs(MATERIALS[one].features - features).sum())
 
 
-def learn(loop, console):
-    returns = []
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task("preparing the planner", total=loop.episodes, completed=loop.done)
-        console.print(f"episode  {aligned(HEADS)}  tried", highlight=False)
-        for episode in loop:
-            console.print(f"{episode.number + 1:7}  {told(episode)}  {episode.explored.split(':')[0]}", highlight=False)
-            returns.append(episode.total if episode.status == "done" else np.nan)
-            recent = np.nanmedian(returns[-10:])
-            progress.update(task, advance=1, description=f"learning; median of the last 10 returns {recent:.2f}")
+def attempts(loop, number):
+    """The (skill, why it was not the best plan) of each attempt of an episode."""
+    plans = list(loop.store.plans(number).values())[1:]  # the first is made again at the receiver
+    return [(plan["selections"]["skill"], plan["explored"].split(":")[0]) for plan in plans]
+
+
+def learn(loop, progress):
+    task = progress.add_task(recent(loop), total=loop.episodes, completed=loop.done)
+    if loop.done < loop.episodes:
+        progress.console.print(f"no.  {aligned(COLUMNS)}  skills")
+        progress.console.print("     amounts in spheres; * drawn to learn more, ? random: seen too little to plan")
+    for episode in loop:
+        skills = ", ".join(skill + WHY[why] for skill, why in attempts(loop, episode.number))
+        progress.console.print(f"{episode.number + 1:3}  {told(episode)}  {skills}")
+        progress.update(task, advance=1, description=recent(loop))
+
+
+def recent(loop):
+    returns = [episode.total for episode in loop.store.episodes(status="done")[-10:]]
+    return f"learned; median of the last 10 returns {np.median(returns):z.2f}" if returns else "preparing the planner"
+
+
+# %%
+# The returns of the attempts tell how it got there. Most of what is lost is lost while it explores.
+
+
+def draw_curve(loop, path):
+    series = {}
+    for episode in loop.store.episodes(status="done"):
+        for (skill, why), gained in zip(attempts(loop, episode.number), episode.info["returns"], strict=True):
+            series.setdefault((skill, "explored" if why else "planned"), []).append((episode.number + 1, gained))
+    figure, axes = plt.subplots(figsize=(8, 3.5), layout="constrained")
+    for (skill, how), points in sorted(series.items()):
+        marker, colour = {"tip": ("o", "tab:blue"), "shake": ("^", "tab:orange")}[skill]
+        face = colour if how == "planned" else "none"
+        axes.scatter(*np.transpose(points), marker=marker, c=face, edgecolors=colour, label=f"{skill}, {how}")
+    axes.set(yscale="symlog", xlabel="episode", ylabel="return of each attempt", title="Learning to pour")
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    figure.legend(loc="outside right upper", fontsize="small")
+    figure.savefig(path, dpi=150)
 
 
 # %%
@@ -125,97 +155,169 @@ def learn(loop, console):
 # first shake among them.
 
 
-def prove(loop, world, console, folder):
-    console.print(f"\nSituations it has never met\n{aligned(HEADS)}  expected", highlight=False)
-    films = {}
-    for seed in range(10**6, 10**6 + PROOFS):
-        filmed = FilmedWorld(world)
-        episode = loop.perform(filmed, seed)
-        expected = episode.expected.get("poured_change", np.nan)
-        console.print(f"{told(episode)}  {expected:.3f}", highlight=False)
-        films.setdefault(episode.selections["skill"], filmed.frames)
-    write_video(folder / "pouring.mp4", [frame for frames in films.values() for frame in frames], fps=20)
+def prove(loop, world, progress):
+    progress.console.print(f"\nSituations it has never met\n{aligned(COLUMNS)}  promised  skills")
+    progress.console.print("promised: the return that the plan of the last attempt expects of it")
+    first = {}
+    for seed in progress.track(range(10**6, 10**6 + PROOFS), description="pouring where it has never been"):
+        episode = loop.perform(world, seed)
+        promised = "random" if episode.explored else f"{episode.value:z.2f}"
+        skills = ", ".join(attempt.selections["skill"] for attempt in world.attempts)
+        progress.console.print(f"{told(episode)}  {promised:>8}  {skills}")
+        for attempt in world.attempts if episode.status == "done" else ():
+            first.setdefault(attempt.selections["skill"], attempt)
+    return list(first.values())
 
 
 # %%
-# The returns tell how it got there. Most of what is lost is lost while it explores.
+# The skill map shows what it would do elsewhere: which skill, and the return that it expects; a cross where it has seen
+# too little to plan. Dots below are the episodes that it has learned from.
 
 
-def draw_curve(loop, folder):
-    episodes = loop.store.episodes(status="done")
-    returns = np.array([episode.total for episode in episodes])
-    skills = np.array([episode.info["selections"]["skill"] for episode in episodes])
-    explored = np.array([bool(episode.info["explored"]) for episode in episodes])
-    figure, axes = plt.subplots(figsize=(8, 3.5), layout="constrained")
-    for skill, marker, colour in (("tip", "o", "tab:blue"), ("shake", "^", "tab:orange")):
-        for tried in (True, False):
-            at = (skills == skill) & (explored == tried)
-            label = f"{skill}, {'explored' if tried else 'planned'}"
-            shade = "none" if tried else colour
-            axes.scatter(np.flatnonzero(at) + 1, returns[at], marker=marker, c=shade, edgecolors=colour, label=label)
-    axes.set(yscale="symlog", xlabel="episode", ylabel="return", title="Learning to pour")
-    axes.legend(ncols=2, fontsize="small")
-    figure.savefig(folder / "learning_curve.png", dpi=150)
-
-
-# %%
-# The skill map shows what it would do in other situations: which skill, and the return that it expects.
-
-
-def draw_map(loop, target, folder):
-    mouths = np.linspace(0.11, 0.25, 8)
-    figure, axes = plt.subplots(figsize=(8, 3), layout="constrained")
-    for j, material in enumerate(MATERIALS):
-        for mouth in mouths:
-            situation = PouringWorld(material, float(mouth), target, receiver_x=0.8).reset(0)
-            plan = loop.plan(situation)
-            marker = {"tip": "o", "shake": "^"}[plan.selections["skill"]]
-            picture = axes.scatter(mouth, j, marker=marker, s=120, c=[plan.value], vmin=-2, vmax=0, cmap="viridis")
-    axes.set(xlabel="mouth", yticks=range(len(MATERIALS)), yticklabels=MATERIALS, ylim=(-0.5, len(MATERIALS) - 0.5))
-    axes.set_title("Planned skill: ○ tip, △ shake")
-    figure.colorbar(picture, label="expected return")
-    figure.savefig(folder / "skill_map.png", dpi=150)
+def draw_map(loop, setup, target, path, progress):
+    materials, mouth = np.atleast_1d(setup["material"]).tolist(), setup["mouth"]
+    situations = list(itertools.product(enumerate(materials), np.unique(np.linspace(np.min(mouth), np.max(mouth), 8))))
+    if len(situations) == 1:
+        return
+    figure, axes = plt.subplots(figsize=(8, 1.2 + 0.5 * len(materials)), layout="constrained")
+    returns = plt.cm.ScalarMappable(plt.Normalize(-2, 0))
+    for (j, material), at in progress.track(situations, description="drawing the skill map"):
+        plan = loop.plan(PouringWorld(material, float(at), target, receiver_x=0.8).reset(0))
+        if plan.status.startswith("interrupted"):
+            raise KeyboardInterrupt
+        marker, colour = {"tip": "o", "shake": "^"}[plan.selections["skill"]], returns.to_rgba(plan.value)
+        marker, colour = ("x", "grey") if plan.status.startswith("exploring") else (marker, colour)
+        axes.scatter(at, j, marker=marker, s=120, color=colour)
+    met = [visit.observed for visit in loop.store.visits(node="start")]
+    rows = [materials.index(nearest(seen["material"], materials)) - 0.3 for seen in met]
+    axes.scatter([seen["mouth"] for seen in met], rows, s=4, color="black")
+    axes.set(xlabel="mouth", yticks=range(len(materials)), yticklabels=materials, ylim=(-0.5, len(materials) - 0.5))
+    axes.set_title(f"Planned skill for an amount of {target:g}: ○ tip, △ shake; dots: episodes", fontsize="medium")
+    figure.colorbar(returns, ax=axes, label="expected return", extend="min")
+    figure.savefig(path, dpi=150)
 
 
 # %%
 # All of it
 # ---------
+# A run's options are kept in its folder, so that ``--resume`` needs no others.
 
+DEFAULTS = {"condition": "general", "episodes": 80, "seed": 0}
+OPTIONS = "options.json"
 Setup = enum.StrEnum("Setup", list(SETUPS))
 Material = enum.StrEnum("Material", list(MATERIALS))
 
 
-def main(
-    condition: Annotated[Setup, typer.Option(help="What situations are drawn.")] = Setup.general,
-    material: Annotated[Material | None, typer.Option(help="Pour this only.")] = None,
-    mouth: Annotated[float | None, typer.Option(help="Width of the mouth, 0.11 to 0.25.")] = None,
-    target: Annotated[float | None, typer.Option(help="Amount to pour; a sphere is 0.0055.")] = None,
-    episodes: Annotated[int, typer.Option(min=1)] = 80,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
-    output: Annotated[Path, typer.Option(help="Folder of all that is kept.")] = Path("output/pour"),
-    resume: Annotated[bool, typer.Option(help="Go on with the run in that folder.")] = False,
-):
-    """Learn to pour from scratch, then pour in situations never met."""
-    console = Console()
-    given = {"material": material and str(material), "mouth": mouth, "target": target}
-    given = {name: value for name, value in given.items() if value is not None}
-    world = PouringWorld(**SETUPS[condition] | given)
-    if not resume:
-        output = unused(output)
-    console.print(f"All is kept in {output}; --resume --output {output} goes on with it", highlight=False)
-    name = " ".join([str(condition), *(f"{name}={value}" for name, value in given.items())])
-    with loop_in(world, name, episodes, seed, output) as loop:
-        learn(loop, console)
-        prove(loop, world, console, output)
-        draw_curve(loop, output)
-        draw_map(loop, 0.3 if target is None else target, output)
-    console.print(f"\nLearning curve, skill map, film, episodes and networks are in {output}", highlight=False)
+def pour(folder, options):
+    given = {name: options[name] for name in ("material", "mouth", "target") if name in options}
+    setup = SETUPS[options["condition"]] | given
+    if setup.get("blend") and "material" in given:
+        raise sg.InputError(f"--material {given['material']}: --condition varied blends all; leave one of them out")
+    try:
+        world = RecordedWorld(PouringWorld(**setup))
+    except ValueError as error:
+        raise sg.InputError(f"--{error}") from None
+    keep(folder, options)
+    console = Console(highlight=False, markup=False, soft_wrap=True)
+    console.print(f"All is kept in {folder}; {resuming(folder)} goes on with it")
+    name = " ".join([options["condition"], *(f"{name}={value}" for name, value in given.items())])
+    curve, skill_map, film = pictures = [folder / one for one in ("learning_curve.png", "skill_map.png", "pouring.mp4")]
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    try:
+        with Progress(*columns, console=console) as progress, loop_in(world, name, options, folder) as loop:
+            for path in pictures if loop.done < loop.episodes else ():
+                path.unlink(missing_ok=True)
+            learn(loop, progress)
+            if not curve.exists():
+                draw_curve(loop, curve)
+            shown = prove(loop, world, progress)
+            if not skill_map.exists():
+                draw_map(loop, setup, options.get("target", 0.3), skill_map, progress)
+            if shown and not film.exists():
+                films = [world.film(attempt) for attempt in progress.track(shown, description="filming")]
+                write_video(film, list(itertools.chain(*films)), fps=8)
+    except KeyboardInterrupt:
+        console.print(f"Stopped after episode {done_in(folder)}; {resuming(folder)} goes on with it")
+        raise typer.Exit(130) from None
+    there = ", ".join(path.name for path in pictures if path.exists())
+    console.print(f"\n{there}, episodes and networks are in {folder}")
+
+
+def kept(folder):
+    path = folder / OPTIONS
+    return json.loads(path.read_text()) if path.exists() else {}
+
+
+def keep(folder, options):
+    folder.mkdir(parents=True, exist_ok=True)
+    new = folder / f"{OPTIONS}.new"
+    new.write_text(json.dumps(options))
+    new.replace(folder / OPTIONS)
+
+
+def done_in(folder):
+    try:
+        with sg.learned.EpisodeStore(folder / "episodes.sqlite", read_only=True) as store:
+            return len(store) - len(store.episodes(status="running"))
+    except sg.StorageError:  # stopped before there was one
+        return 0
+
+
+def resumed(folder, asked):
+    options = kept(folder)
+    if not options:
+        raise sg.InputError(f"--resume: there is no run in {folder}; name the folder of one with --output")
+    for name, value in asked.items():
+        has = options.get(name, "none")
+        if value < has if name == "episodes" else value != has:
+            raise sg.InputError(f"--{name} {value}: the run in {folder} has {has}; leave --{name} or --resume out")
+    return options | asked
+
+
+def resuming(folder):
+    words = shlex.join(["--resume", "--output", str(folder)])
+    if "MAKELEVEL" in os.environ:
+        return f'make pour ARGS="{words}"'
+    path = shlex.quote(os.environ.get("PYTHONPATH", "."))
+    return f"PYTHONPATH={path} {shlex.join([sys.executable, sys.argv[0]])} {words}"
 
 
 def unused(folder):
-    """The folder, or one beside it that holds no run yet."""
-    beside = (folder.with_name(f"{folder.name}-{number}") for number in itertools.count(2))
-    return next(one for one in itertools.chain([folder], beside) if not (one / "episodes.sqlite").exists())
+    beside = (folder.parent / f"{folder.name}-{number}" for number in itertools.count(2))
+    for one in itertools.chain([folder], beside):
+        options = kept(one)
+        if not options and not (one / "episodes.sqlite").exists():
+            break
+        if options and (done := done_in(one)) < options["episodes"]:
+            print(f"{one} is unfinished ({done} of {options['episodes']} episodes); {resuming(one)} goes on with it")
+    return one
+
+
+def main(
+    condition: Annotated[Setup | None, Option(help="What is drawn, see above.", show_default="general")] = None,
+    material: Annotated[Material | None, Option(help="Pour this only; not with varied, which blends.")] = None,
+    mouth: Annotated[float | None, Option(help="Width of the mouth.", min=0.11, max=0.25)] = None,
+    target: Annotated[float | None, Option(help="Amount to pour, 0.0055 a sphere.", min=0, max=0.54)] = None,
+    episodes: Annotated[int | None, Option(help="To learn from; may grow later.", min=1, show_default="80")] = None,
+    seed: Annotated[int | None, Option(help="Of all that is random.", min=0, show_default="0")] = None,
+    output: Annotated[Path, Option(help="Folder of all that is kept; numbered if taken.")] = Path("output/pour"),
+    resume: Annotated[bool, Option("--resume", help="Go on with the run in that folder and its options.")] = False,
+):
+    """Learn to pour from scratch, then pour in situations never met.
+
+    Every episode draws a situation: "general" any material and mouth; "setup1"
+    is bnc through 0.23, "setup2" vsc through 0.13; "varied" also blends
+    materials, and draws the amount and the receiver's size.
+    """
+    given = {"material": material, "mouth": mouth, "target": target}
+    asked = {"condition": condition, **given, "episodes": episodes, "seed": seed}
+    asked = {name: value for name, value in asked.items() if value is not None}
+    try:
+        folder, options = (output, resumed(output, asked)) if resume else (unused(output), DEFAULTS | asked)
+        pour(folder, options)
+    except (sg.SymgraphError, OSError) as error:
+        typer.echo(error if isinstance(error, sg.SymgraphError) else f"--output {output}: {error}", err=True)
+        raise typer.Exit(2) from None
 
 
 if __name__ == "__main__":

@@ -7,7 +7,8 @@ import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -15,12 +16,13 @@ import imageio.v3 as imageio
 import mujoco
 import numpy as np
 
+from sims.pouring.behaviour import Phase
 from sims.pouring.census import SphereClass
 from sims.pouring.geometry import SPHERES
 from sims.pouring.observation import Observation
 from sims.pouring.scene import CONTROL_STEP
 from sims.pouring.simulation import Simulation
-from sims.pouring.world import Actions, PouringWorld, Selections
+from sims.pouring.world import Actions, PouringWorld, Selections, WorldState
 
 VIDEO_ENDINGS = (".mp4", ".gif")
 COLOURS = {
@@ -122,39 +124,66 @@ def film(world: PouringWorld, camera: Camera, every: int = 8) -> Iterator[list[n
         listeners.remove(look)
 
 
-class FilmedWorld:
-    """A world that is filmed from each reset to the next.
-
-    Args:
-        world: What to film.
-        every: Control steps from one picture to the next.
+@dataclass(frozen=True)
+class Attempt:
+    """An attempt as it began.
 
     Attributes:
-        frames: Pictures of the present episode.
+        state: Of the world at "at_receiver".
+        actions: Label -> value.
+        selections: {"skill": "tip" or "shake"}.
     """
 
-    def __init__(self, world: PouringWorld, every: int = 4) -> None:
+    state: WorldState
+    actions: Actions
+    selections: Selections
+
+
+class RecordedWorld:
+    """A world that remembers how attempts began, since drawing takes longer than simulating: film afterwards.
+
+    Args:
+        world: What to record.
+
+    Attributes:
+        attempts: Of the present episode.
+    """
+
+    def __init__(self, world: PouringWorld) -> None:
         self._world = world
-        self._every = every
-        self._camera = Camera(world)
-        self._film = ExitStack()
-        self.frames: list[np.ndarray] = []
+        self.attempts: list[Attempt] = []
 
     def reset(self, seed: int) -> Observation:
-        """Begin an episode and its film."""
-        seen = self._world.reset(seed)
-        self._film.pop_all()  # the old listener went with the old simulation
-        self.frames = self._film.enter_context(film(self._world, self._camera, self._every))
-        return seen
+        """Begin an episode."""
+        self.attempts = []
+        return self._world.reset(seed)
 
-    def execute(self, node: str, actions: Actions, selections: Selections | None = None) -> dict[str, Observation]:
+    def execute(self, node: str, actions: Actions, selections: Selections) -> dict[str, Observation]:
         """Do what leaves a node."""
+        if node == Phase.AT_RECEIVER.value:
+            self.attempts.append(Attempt(self._world.save(), copy.deepcopy(actions), dict(selections)))
         return self._world.execute(node, actions, selections)
 
+    def film(self, attempt: Attempt, every: int = 12, size: int = 320) -> list[np.ndarray]:
+        """Return pictures of an attempt, which is made once more, from "at_receiver" to "poured".
+
+        Args:
+            attempt: Whose actions were decided when it began.
+            every: Control steps from one picture to the next.
+            size: Width and height of the pictures [pixels].
+        """
+        self._world.restore(attempt.state)
+        camera = Camera(self._world, size, size)
+        try:
+            with film(self._world, camera, every) as frames:
+                while self._world.node != Phase.POURED.value:
+                    self._world.execute(self._world.node, attempt.actions, attempt.selections)
+        finally:
+            camera.close()
+        return frames
+
     def close(self) -> None:
-        """Let go of the camera and the world."""
-        self._film.close()
-        self._camera.close()
+        """Let go of the world."""
         self._world.close()
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from sims.pouring import PouringWorld
 from sims.pouring.census import SphereClass
-from sims.pouring.rendering import COLOURS, Camera, film, strip, viewer, write_picture, write_video
+from sims.pouring.rendering import COLOURS, Camera, RecordedWorld, film, strip, viewer, write_picture, write_video
 
 
 @pytest.fixture
@@ -66,6 +66,25 @@ def test_a_film_becomes_a_strip_and_a_video(world, tmp_path):
         write_video(tmp_path / "film.avi", frames, fps=10)
     camera.close()
     gc.collect()  # here, so that what the collector says is ignored here
+
+
+def test_an_attempt_is_filmed_as_it_was_made():
+    actions = {"grasp_ratio": 0.5, "pour_position": (-0.2, 0.4), "tilt_rate": 0.02, "search_rate": 0.005}
+    world = PouringWorld("wat", 0.25, target=0.05, receiver_x=0.6)
+    recorded = RecordedWorld(world)
+    recorded.reset(0)
+    while world.node != "poured":
+        recorded.execute(world.node, actions, {"skill": "tip"})
+    poured, metrics = world.save(), world.metrics
+    (attempt,) = recorded.attempts
+    assert attempt.selections == {"skill": "tip"}
+    recorded.reset(1)
+    assert not recorded.attempts
+    frames = recorded.film(attempt, every=100, size=64)
+    assert len(frames) > 3
+    assert frames[0].shape == (64, 64, 3)
+    assert world.metrics == metrics
+    assert np.array_equal(world.save().behaviour.simulation.physics, poured.behaviour.simulation.physics)
 
 
 def test_a_missing_screen_is_named(world, monkeypatch):
