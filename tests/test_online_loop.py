@@ -60,7 +60,7 @@ def test_reports_say_what_happened(learned):
     one, reports, _ = learned
     assert [report.number for report in reports] == list(range(28))
     assert "exploring: model 'near' has 0 of 3 samples" in reports[0].explored
-    assert {r.explored for r in reports} >= {"", "drawn: selections", "drawn: actions", "drawn: selections, actions"}
+    assert {report.explored for report in reports} >= {"", "drawn: selections", "drawn: selections, actions"}
     for report in reports:
         assert (report.setup, report.status, report.reason, report.attempts) == ("toy", "done", "", 1)
         assert report.total == pytest.approx(-((report.known["y"] - 1.0) ** 2), rel=1e-12)
