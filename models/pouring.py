@@ -206,7 +206,7 @@ SKILL_ACTIONS: dict[str, dict[str, int]] = {
 # the target is reached, or the source is empty, or it has tried often enough.
 TRIALS = {"decisions": ("at_receiver",), "again": "poured", "attempts": 4}
 # Most is learned near the plans, see docs/reproduction/pouring.
-EXPLORATION = {"actions": 0.15, "noise": 0.2}
+EXPLORATION = {"actions": 0.15, "noise": 0.1}
 # Single accidents spill 30 to 70 spheres; learned as they are, nothing else would count. [amount]
 LIMITS = {"spilled_change": (0.0, 1.0)}
 # Standard deviations below which what is observed is noise [length, amount].

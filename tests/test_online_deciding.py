@@ -159,6 +159,8 @@ def test_actions_come_closer_to_plans_and_selections_end_at_once():
         assert [now.actions, now.noise] == pytest.approx([0.4 * share, 0.1 * share])
         assert now.selections == (0.5 if episode < 20 else 0.0)
         assert [now.at(0).selections, now.at(1).selections] == [now.selections, 0.0]
+        assert now.explores == (episode < 20)
+    assert not Exploration(0.0, 0.0, 0.0).explores
     assert Exploration(episodes=np.int64(3)) == Exploration(episodes=3)
     for name, value in (("selections", 1.5), ("actions", -0.1), ("noise", math.nan), ("noise", True)):
         words = f"{name} = {value!r}; give a number from 0 to 1"

@@ -139,21 +139,26 @@ def test_each_attempt_of_an_episode_counts_as_made(tmp_path):
     assert all(set(pair) == {"high", "low"} for pair in zip(ways[::2], ways[1::2], strict=False))
 
 
-@pytest.mark.parametrize("drawn", [True, False])
-def test_what_is_drawn_is_planned_as_if_models_were_certain(tmp_path, drawn):
-    """A cautious plan kicks "far" gently, for its spread grows with the kick: what it does then it never learns."""
+@pytest.mark.parametrize(
+    ("explore", "kick"),
+    [(ALL, 1.0 / 1.5), (Exploration(0.0, 1e-9, 0.0, episodes=ALWAYS), 1.0 / 1.5), (NOTHING, 1.5 / 11.25)],
+    ids=["selections", "actions", "nothing"],
+)
+def test_while_it_explores_plans_take_models_for_certain(tmp_path, explore, kick):
+    """A cautious plan kicks "far" gently, for its spread grows with the kick: what it does then it never learns.
+
+    E = -(1.5 u - 1)² - (s u)² is greatest at u = 1.5 / (2.25 + s²), with s = 3 unless it is certain.
+    """
     near, _ = spies()
     wide = Wide({"u": 1, "s": 1}, {"y": 1}, "far", [1.5, 0.0])
     world = Scripted({"s": 0.0}, {"aim": lambda a, s, world: {f"{s['skill']}_end": {"y": 1.5 * a["u"]}}})
-    explore = ALL if drawn else NOTHING
     with loop(tmp_path, kick_graph(near, wide), world, 6, explore) as one:
-        reports = list(one)
-    kicked = [actions["u"] for _, actions, selections in world.calls if selections["skill"] == "far"]
-    assert len(kicked) >= 3
-    # E = -(1.5 u - 1)^2 - (s u)^2 is greatest at u = 1.5 / (2.25 + s^2), with s = 3 unless it is certain
-    assert kicked == pytest.approx([1.0 / 1.5 if drawn else 1.5 / 11.25] * len(kicked), abs=1e-3)
+        assert [report.status for report in one] == ["done"] * 6
+        kicked = [actions["u"] for _, actions, selections in world.calls if selections["skill"] == "far"]
+        assert len(kicked) >= 3
+        assert kicked == pytest.approx([kick] * len(kicked), abs=1e-3)
+        assert one.plan({"s": 0.0}).actions["u"] == pytest.approx(1.5 / 11.25, abs=1e-3)
     assert wide.spread.value == 3.0
-    assert all(report.status == "done" for report in reports)
 
 
 class Wide(Spy):

@@ -53,7 +53,7 @@ SETUPS = {
     },
 }
 PROOFS = 6  # situations at the end that it has never met
-EXPLORED = 60  # episodes in which it tries something beside its plans
+EXPLORED = 50  # episodes in which it tries something beside its plans
 
 # %%
 # The task and the loop

@@ -168,10 +168,9 @@ class Decider:
         known = self._knowledge.at[visit.step]
         actions, selections = self.decision
         ahead = _ahead(objective.tree)
-        # A choice that is tried because it is known little must be given its best chance: planned for all that may go
-        # wrong, it would be done where nothing can go right either, and would never be learned.
-        curious = any(label in self._fixed and label in ahead for label in graph.selections())
-        with _as_zero(self._planning.spreads if curious else ()):
+        # What is known little must be given its best chance while there is time to try: planned for all that may go
+        # wrong, it would be left alone, or done where nothing can go right either, and would never be learned.
+        with _as_zero(self._planning.spreads if self._explore.explores else ()):
             plan = solve(
                 objective,
                 {label: known[label] for label in graph.states() if label in known},

@@ -23,7 +23,7 @@ class EpisodeReport:
         actions: {label: value} decided last.
         selections: {label: choice} decided last.
         expected: {label: mean} of what the last plan promised.
-        value: that the last plan promised; where a selection was drawn, as if learned models were certain, and so is
+        value: that the last plan promised; while the stage explores, as if learned models were certain, and so is
             `expected`.
         explored: why the last decision was not the best plan, "drawn: selections, actions" or "exploring: …"; empty if
             it was, but for noise.

@@ -44,15 +44,15 @@ class World(Protocol):
 class Exploration:
     """How much is tried beside what is planned, in the first episodes.
 
-    Actions come closer and closer to plans. Selections do not: a choice that looks bad is learned well only by tries
+    As long as anything is tried, plans take learned models for certain: what they do not know of a choice is no reason
+    to leave it alone. Actions come closer and closer to plans; selections do not, for a choice is learned best by tries
     that are as good as can be, and those come last. Beside that, `solve` explores by itself while a model has too few
     samples.
 
     Args:
         selections: probability that an attempt's selections are drawn instead of planned. What is drawn is the choice
             known least: the one with the lowest density of tries, of all stages, in the situation. Situations are told
-            apart by those states that learned models read and that are known where an episode starts. The rest is
-            planned as if learned models were certain.
+            apart by those states that learned models read and that are known where an episode starts.
         actions: probability that its actions are drawn from their whole range, in the first episode; falls linearly.
         noise: standard deviation of what is added to actions that are not drawn, as a share of their range, in the
             first episode; falls linearly.
@@ -62,7 +62,7 @@ class Exploration:
         InputError: a number outside its range.
     """
 
-    selections: float = 0.8
+    selections: float = 0.4
     actions: float = 1.0
     noise: float = 0.1
     episodes: int = 50
@@ -73,6 +73,11 @@ class Exploration:
             if isinstance(value, bool) or not isinstance(value, (int, float, np.integer)) or not 0 <= value <= most:
                 wanted = "of at least 0" if math.isinf(most) else f"from 0 to {most:g}"
                 raise InputError(f"Exploration: {name} = {value!r}; give a number {wanted}")
+
+    @property
+    def explores(self) -> bool:
+        """Whether anything is tried."""
+        return bool(self.episodes and (self.selections or self.actions or self.noise))
 
     def at(self, episode: int) -> Exploration:
         """Return how much is tried in an episode, from 0 on, and in no other."""
