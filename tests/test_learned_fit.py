@@ -102,11 +102,11 @@ def test_an_interrupted_fit_has_changed_nothing(monkeypatch, call):
 
     train, calls = learner_module.train, []
 
-    def interrupted(*arguments):
+    def interrupted(*arguments, **options):
         calls.append(1)
         if len(calls) == call:
             raise Interrupted
-        return train(*arguments)
+        return train(*arguments, **options)
 
     monkeypatch.setattr(learner_module, "train", interrupted)
     with pytest.raises(Interrupted):
