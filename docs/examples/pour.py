@@ -7,7 +7,7 @@ like paste. It is to pour 55 of them into another container. It can *tip* its co
 *shake*; neither is best everywhere. How spheres flow it does not know: it learns that while it pours, as in section VII
 of Yamaguchi & Atkeson, *Differential Dynamic Programming for Graph-Structured Dynamical Systems*, Humanoids 2016.
 
-``make pour`` runs this file: about four minutes for 80 episodes. Other tasks are options, such as
+``make pour`` runs this file: four to six minutes for 80 episodes. Other tasks are options, such as
 ``make pour ARGS="--material vsc --mouth 0.13"``; ``make pour ARGS=--help`` lists them. It prints the command that
 goes on with it where it was stopped.
 """
