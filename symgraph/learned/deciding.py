@@ -167,7 +167,6 @@ class Decider:
         graph, objective = self._planning.graph, self._planning.objectives[visit.node]
         known = self._knowledge.at[visit.step]
         actions, selections = self.decision
-        ahead = _ahead(objective.tree)
         # What is known little must be given its best chance while there is time to try: planned for all that may go
         # wrong, it would be left alone, or done where nothing can go right either, and would never be learned.
         with _as_zero(self._planning.spreads if self._explore.explores else ()):
@@ -183,6 +182,7 @@ class Decider:
         if plan.status.startswith("interrupted"):  # solve returns what it has; the loop is to stop
             raise KeyboardInterrupt
         explores = plan.status.startswith("exploring")
+        ahead = _ahead(objective.tree)
         # What lies behind stays as it was.
         decided = {
             label: value if explores else self._disturbed(label, value)

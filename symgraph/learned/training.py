@@ -170,11 +170,10 @@ def train(
         judged = np.sort(rng.choice(judged, MOST_SCORED, replace=False))
     scored = _Scored([judged[folds[judged] == k] for k in range(held_out_copies)], inputs, wanted)
 
-    shapes = [a.shape for pair in zip(copies.weights, copies.biases, strict=True) for a in pair]
+    parts = [a for pair in zip(copies.weights, copies.biases, strict=True) for a in pair]
+    shapes = [part.shape for part in parts]
     # All weights in one vector: one call of Adam moves them, one average follows.
-    flat = torch.cat(
-        [torch.from_numpy(a).flatten() for pair in zip(copies.weights, copies.biases, strict=True) for a in pair]
-    )
+    flat = torch.cat([torch.from_numpy(part).flatten() for part in parts])
     average, best, slope = flat.clone(), flat.clone(), torch.zeros_like(flat)
     tensors, averages, slopes = (_views(one, shapes) for one in (flat, average, slope))
     m = shapes[-1][-1]
