@@ -99,9 +99,10 @@ def test_adadelta_takes_the_same_steps(wavy_kernels, point, scaled, keep_best, s
     steps = steps_of(1e-2, 1e-14, scale, 5, scaled, keep_best)
     interpreted, compiled = [k.ascend(np.array(point), NONE, 80, steps) for k in wavy_kernels]
     assert compiled.outcome == interpreted.outcome
-    assert_close(compiled.history, interpreted.history)
-    assert_close(compiled.point, interpreted.point)
-    assert_close(compiled.value, interpreted.value)
+    # Rounding differs, and up and down the waves every step multiplies what differs.
+    assert_close(compiled.history, interpreted.history, 1e-10)
+    assert_close(compiled.point, interpreted.point, 1e-10)
+    assert_close(compiled.value, interpreted.value, 1e-10)
 
 
 def test_climbing_leads_to_the_same_optimum(wavy_kernels):

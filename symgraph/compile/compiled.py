@@ -16,7 +16,7 @@ from symgraph.compile.toolchain import load
 from symgraph.errors import CompileError
 from symgraph.slots import Array
 
-# The point-by-point call of CasADi's function, before search.c.
+# The point-by-point call of CasADi's function, between that and search.c.
 _HEAD = """
 #define N_ACTIONS {n_actions}
 struct inputs {{ const double *selections; const double *const *shared; double *w; }};
@@ -81,7 +81,7 @@ class CompiledKernel(Kernel):
     """
 
     def __init__(self, function: ca.Function, compiler: str) -> None:
-        generator = ca.CodeGenerator("kernel", {"with_header": False})
+        generator = ca.CodeGenerator("kernel", {"with_header": False, "include_math": False})
         generator.add(function)
         sizes = {
             "name": function.name(),
@@ -93,8 +93,8 @@ class CompiledKernel(Kernel):
             "n_shared": function.n_in() - 2,
             "work": function.sz_w(),
         }
-        search = (resources.files("symgraph.compile") / "search.c").read_text()
-        self._source = _with_fast_products(generator.dump()) + _HEAD.format(**sizes) + search + _TAIL.format(**sizes)
+        function_code = _text("extrema.c") + _with_fast_products(generator.dump())
+        self._source = function_code + _HEAD.format(**sizes) + _text("search.c") + _TAIL.format(**sizes)
         self._compiler = compiler
         self.n_actions, self.n_selections = function.numel_in(0), function.numel_in(1)
         self._load()
@@ -191,7 +191,7 @@ def _with_fast_products(source: str) -> str:
     call = "casadi_mtimes_dense("
     if call not in source:
         return source
-    products = (resources.files("symgraph.compile") / "matrices.c").read_text()
+    products = _text("matrices.c")
     theirs = re.compile(r"void casadi_mtimes_dense\([^)]*\) \{\n.*?\n\}\n", re.DOTALL)
     replaced, times = theirs.subn(lambda _: products, source)
     if times != 1:
@@ -199,6 +199,11 @@ def _with_fast_products(source: str) -> str:
             f"CasADi {ca.CasadiMeta.version()} writes {call}…) in another form than is known; please report it"
         )
     return replaced
+
+
+def _text(name: str) -> str:
+    """Return a C file of this package."""
+    return (resources.files("symgraph.compile") / name).read_text()
 
 
 def contiguous(column: Array) -> Array:
