@@ -123,7 +123,7 @@ CONDITIONS = [
     Condition("general", "PT0-Rnone, both skills tried", 80, BOTH_SKILLS),
     Condition("general", "PT0-Rnone, both skills tried, one attempt", 80, BOTH_SKILLS, attempts=1),
     # What narrow layers make of 80 episodes wider ones do not; with 300 or more, plans of wider ones are better.
-    Condition("varied", "PT0-Rnone, both skills tried", 300, BOTH_SKILLS_VARIED, hidden=(64, 64)),
+    Condition("varied", "PT0-Rnone, both skills tried", 500, BOTH_SKILLS_VARIED, hidden=(64, 64)),
 ]
 
 
