@@ -5,8 +5,11 @@ import itertools
 import numpy as np
 import pytest
 
-from symgraph.learned import StochasticNetwork
-from symgraph.learned.initialisation import begin_linear, carries_linear, initial_copies
+from symgraph.learned import StochasticNetwork, losses
+from symgraph.learned.initialisation import begin_linear, carries_linear, initial_copies, unit_carriers
+from symgraph.learned.learner import Learner
+from symgraph.learned.perceptron import Scaling
+from symgraph.progress import Progress
 
 
 def output(copies, k, x):
@@ -114,3 +117,49 @@ def test_a_linear_function_is_learned_from_few_samples():
     network.fit(x[:30], x[:30] @ slope, progress=False)
     wrong = network.predict(x[30:])[0] - x[30:] @ slope
     assert np.sqrt(np.mean(wrong**2)) < 0.05 * (x @ slope).std()
+
+
+@pytest.mark.parametrize("sizes", [(3, 8, 2), (3, 8, 6, 2), (3, 8, 6, 5, 2)], ids=str)
+def test_unit_carriers_change_nothing_but_the_carriers(sizes):
+    rng = np.random.default_rng(3)
+    x = rng.normal(size=(40, 3))
+    copies = initial_copies(sizes, x, 3, rng)
+    begin_linear(copies, x, rng.normal(size=(40, 2)), np.arange(40) % 5)
+    for layer, weights in enumerate(copies.weights):  # as if trained
+        noise = rng.normal(size=weights.shape).astype(np.float32)
+        if layer:
+            noise[:, :2, :2] = 0.0
+        weights += noise
+    factors = np.array([0.02, 30.0])
+    copies.weights[-1] *= factors.astype(np.float32)
+    before = [output(copies, k, x) / factors for k in range(3)]
+    unit_carriers(copies)
+    for k in range(3):
+        np.testing.assert_allclose(output(copies, k, x) / factors, before[k], atol=2e-5)
+    for weights in copies.weights[1:]:
+        np.testing.assert_array_equal(weights[:, :2, :2], np.broadcast_to(np.eye(2), (3, 2, 2)))
+
+
+def test_slopes_cost_the_same_in_a_fit_that_goes_on_as_in_one_from_scratch():
+    """An output that has hardly varied at first is scaled anew by a factor of thirty."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(60, 3))
+    y = np.where(np.arange(60) < 55, 0.1, 10.0)[:, None] * x[:, :1]
+    learner, memory = Learner(), None
+    for n in (55, 60):
+        scaling = Scaling.of(x[:n]), Scaling.of(y[:n])
+        schedule = learner.plan(x[:n], y[:n], warm=memory is not None)
+        options = {"linear": True, "decay": 3.0}
+        memory, _ = learner.fit(
+            memory,
+            (3, 8, 1),
+            x[:n],
+            y[:n],
+            scaling,
+            losses.squares,
+            schedule,
+            rng,
+            Progress("training", shown=False),
+            **options,
+        )
+    np.testing.assert_array_equal(memory.copies.weights[-1][:, :1, :1], np.ones((6, 1, 1)))

@@ -84,3 +84,24 @@ def begin_linear(copies: Copies, x: Array, targets: Array, folds: npt.NDArray[np
                 weights[copy, :m, :m] = np.eye(m)
             else:
                 weights[copy, :m], biases[copy, 0] = np.eye(m), -lift
+
+
+def unit_carriers(copies: Copies) -> None:
+    """Let what hands linear functions on be 1 again after outputs were scaled anew; copies do the same as before.
+
+    max(0, c h) = c max(0, h) for c > 0, so that the factors move to where the linear functions are formed. Training
+    leaves what hands them on as it is: with other factors, slopes would cost more or less than decay says.
+
+    Args:
+        copies: from `begin_linear`, trained and scaled anew.
+    """
+    m = copies.weights[-1].shape[2]
+    factors = np.diagonal(copies.weights[-1][:, :m, :m], axis1=1, axis2=2).copy()  # (M, m)
+    last = len(copies.weights) - 1
+    for layer, (weights, biases) in enumerate(zip(copies.weights, copies.biases, strict=True)):
+        if layer < last:
+            weights[:, :, :m] *= factors[:, None]
+            biases[:, :, :m] *= factors[:, None]
+        if layer > 0:
+            weights[:, :m] /= factors[:, :, None]
+            weights[:, :m, :m] = np.eye(m)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from symgraph.learned.initialisation import begin_linear, carries_linear, initial_copies
+from symgraph.learned.initialisation import begin_linear, carries_linear, initial_copies, unit_carriers
 from symgraph.learned.perceptron import Scaling, rescaled
 from symgraph.learned.training import Copies, Folds, Loss, Training, active_folds, default_steps, train
 from symgraph.progress import Progress
@@ -122,6 +122,8 @@ class Learner:
         targets = y if scaling[1] is None else scaling[1](y)
         if schedule.warm and memory is not None and memory.copies.count >= count:
             copies = rescaled(memory.copies.first(count), (memory.x, memory.y), scaling)
+            if linear:
+                unit_carriers(copies)
         else:
             copies = initial_copies(sizes, inputs, count, rng)
             if last_bias is not None:
