@@ -31,7 +31,13 @@ class CompileError(SymgraphError, RuntimeError):
 
 
 class StorageError(SymgraphError, OSError):
-    """A file that cannot be written or read, is damaged, or holds something else."""
+    """A file that cannot be written or read, is damaged, or holds something else.
+
+    Attributes:
+        damage: which file is damaged, and in what way; empty if that is not what is wrong.
+    """
+
+    damage: str = ""
 
 
 class MissingExtraError(SymgraphError, ImportError):

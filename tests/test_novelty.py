@@ -44,6 +44,13 @@ def test_where_all_situations_are_the_same_choices_take_turns():
     assert len(least([0.3], *tries)) == 2
 
 
+@pytest.mark.filterwarnings("error")
+def test_situations_that_are_far_beyond_all_tries():
+    assert least([1e300], ([1.0], "tip"), ([1.0 + 1e-5], "tip")) == ["shake"]
+    assert len(least([1e300], ([1.0], "tip"), ([1.0 + 1e-5], "shake"))) == 2
+    assert len(least([1e308], ([-1e308], "tip"), ([-1e308 + 1e300], "shake"))) == 2
+
+
 def test_many_tries_nearby_outweigh_one_that_is_nearer():
     tips = [([0.1 * k], "tip") for k in range(10)]
     assert least([0.45], *tips, ([0.44], "shake"), ([2.0], "shake")) == ["shake"]

@@ -162,11 +162,12 @@ def test_actions_come_closer_to_plans_and_selections_end_at_once():
         assert now.explores == (episode < 20)
     assert not Exploration(0.0, 0.0, 0.0).explores
     assert Exploration(episodes=np.int64(3)) == Exploration(episodes=3)
+    assert Exploration(noise=np.float32(0.5)) == Exploration(noise=0.5)
     for name, value in (("selections", 1.5), ("actions", -0.1), ("noise", math.nan), ("noise", True)):
-        words = f"{name} = {value!r}; give a number from 0 to 1"
+        words = f"{name} is {value!r}; give a number from 0 to 1"
         refuses(lambda name=name, value=value: Exploration(**{name: value}), sg.InputError, words)
     for value in (-1, "many"):
-        words = f"episodes = {value!r}; give a number of at least 0"
+        words = f"episodes is {value!r}; give a number of at least 0"
         refuses(lambda value=value: Exploration(episodes=value), sg.InputError, words)
 
 

@@ -287,6 +287,17 @@ def test_models_that_cannot_be_kept_are_refused(tmp_path):
         "choice 'far': model 'half' has a method 'fit' but no 'parameters'",
         "take 'fit' away",
     )
+    for spread in ("spread", sg.Parameter(1.0, "spread")):
+        spreading = Spy({"u": 1, "s": 1}, {"y": 1}, "far")
+        spreading.spreads = (spread,)
+        refuses(
+            lambda one=spreading: loop(tmp_path, kick_graph(None, one), kicking()),
+            sg.InputError,
+            "choice 'far'",
+            "'spreads'",
+            "spread",
+            "'parameters'",
+        )
     one, other = (Spy({"u": 1, "s": 1}, {"y": 1}, name) for name in ("my kick", "my_kick"))
     refuses(lambda: loop(tmp_path, kick_graph(one, other), kicking()), sg.InputError, "my_kick.safetensors", "differ")
     same = (Spy({"u": 1, "s": 1}, {"y": 1}, "kick") for _ in range(2))

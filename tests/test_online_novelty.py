@@ -6,6 +6,7 @@ from online_worlds import ALWAYS, NOTHING, Scripted, Spy, carry_graph, carrying,
 
 import symgraph as sg
 from symgraph.learned import Exploration
+from symgraph.learned.deciding import Decider
 
 HALF = Exploration(selections=0.5, actions=0.0, noise=0.0, episodes=ALWAYS)
 ALL = Exploration(selections=1.0, actions=0.0, noise=0.0, episodes=ALWAYS)
@@ -173,3 +174,50 @@ class Wide(Spy):
     def propagate(self, inputs):
         mean = super().propagate(inputs)["y"].mean
         return {"y": sg.Gaussian(mean, (self.spread.symbol * inputs["u"].mean) ** 2)}
+
+
+def test_parallel_strands_of_an_attempt_count_for_it(tmp_path, monkeypatch):
+    """An attempt begins where the world has led back, not where it was asked to: other strands may go on meanwhile."""
+    graph = sg.Graph(kick_slots(), start="aim")
+    graph.edge("aim", "end")
+    graph.edge("aim", "side")
+    near, far = spies()
+    graph.choose("side", "skill", {"near": ("near_end", near), "far": ("far_end", far)})
+    for node in ("near_end", "far_end"):
+        graph.reward(node, lambda y: -((y - 1.0) ** 2))
+    side = Scripted(
+        {"s": 0.2},
+        {
+            "aim": {"end": {}, "side": {}},
+            "end": {"aim": {}},
+            "side": lambda actions, selections, world: {f"{selections['skill']}_end": {"y": 0.5}},
+        },
+    )
+    deciders = []
+    begin = Decider.__init__
+
+    def noted(self, *arguments, **options):
+        deciders.append(self)
+        begin(self, *arguments, **options)
+
+    monkeypatch.setattr(Decider, "__init__", noted)
+    with loop(tmp_path, graph, side, 1, NOTHING, again="end", attempts=2) as one:
+        next(iter(one))
+        made = [tried for _, tried in one._past.tries]
+        assert [list(tried) for tried in made] == [["skill"], ["skill"]]
+        assert [tried for _, tried in deciders[0]._tries] == made
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_planning_that_breaks_off_leaves_models_as_they_were(tmp_path, monkeypatch, error):
+    near, _ = spies()
+    wide = Wide({"u": 1, "s": 1}, {"y": 1}, "far", [1.5, 0.0])
+
+    def broken(*arguments, **options):
+        assert wide.spread.value == 0.0
+        raise error
+
+    monkeypatch.setattr("symgraph.learned.deciding.solve", broken)
+    with loop(tmp_path, kick_graph(near, wide), Scripted({"s": 0.0}, {}), 1, ALL) as one, pytest.raises(error):
+        next(iter(one))
+    assert wide.spread.value == 3.0

@@ -221,7 +221,8 @@ def tries_of(planning: Planning, knowledge: Knowledge, visits: Sequence[Visit], 
     tries: list[Try] = []
     made: set[str] = set()
     for step, selections in sorted(left.items()):
-        if visits[step].node == planning.again:
+        parent = visits[step].parent
+        if parent is not None and visits[parent].node == planning.again:
             made = set()
         tries += _tries_at(planning, knowledge, visits[step], selections, made)
     return tries
@@ -250,7 +251,7 @@ def _situation(planning: Planning, knowledge: Knowledge, step: int) -> Array:
 
 @contextmanager
 def _as_zero(parameters: Sequence[Parameter]) -> Iterator[None]:
-    """Let parameters be 0 in between."""
+    """Let parameters be 0 in between. In other threads they are 0 meanwhile as well: a loop belongs to one."""
     kept = [parameter.value for parameter in parameters]
     try:
         for parameter, value in zip(parameters, kept, strict=True):

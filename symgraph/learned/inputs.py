@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, TypeVar
 
@@ -39,14 +40,12 @@ def checked_count(value: Any, place: str) -> int:
     return int(value)
 
 
-def checked_number(value: Any, place: str) -> float:
-    """Return a finite number of at least 0; raise InputError naming the place otherwise."""
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, (int, float, np.integer, np.floating))
-        or not 0 <= value < 1e300
-    ):
-        raise InputError(f"{place} is {value!r}; give a number of at least 0")
+def checked_number(value: Any, place: str, most: float) -> float:
+    """Return a number from 0 to `most`; raise InputError naming the place otherwise."""
+    number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    if not number or not 0 <= value <= most:
+        wanted = "of at least 0" if math.isinf(most) else f"from 0 to {most:g}"
+        raise InputError(f"{place} is {value!r}; give a number {wanted}")
     return float(value)
 
 

@@ -77,7 +77,7 @@ class OnlineLoop:
     ) -> None:
         if isinstance(stages, Stage) or not stages or not all(isinstance(stage, Stage) for stage in stages):
             raise InputError(f"stages = {stages!r}; give a list of Stage")
-        _check_names([stage.name for stage in stages])
+        _check_names(stages)
         self.graph = graph
         self.stages = tuple(stages)
         self.folder = checked_path(folder)
@@ -311,12 +311,13 @@ class OnlineLoop:
         return self._planning.objectives[self.graph.start].tree.needed_states
 
 
-def _check_names(stages: Sequence[str]) -> None:
+def _check_names(stages: Sequence[Stage]) -> None:
     """Raise InputError where two stages have one name: nobody could tell their episodes apart."""
-    for i, name in enumerate(stages):
-        if name in stages[:i]:
+    first: dict[str, int] = {}
+    for i, name in enumerate(stage.name for stage in stages):
+        if first.setdefault(name, i) != i:
             raise InputError(
-                f"stages[{stages.index(name)}] and stages[{i}] are both named {name!r}; give each a name of its own, "
+                f"stages[{first[name]}] and stages[{i}] are both named {name!r}; give each a name of its own, "
                 f"under which its episodes are stored"
             )
 

@@ -38,6 +38,7 @@ STARTS: tuple[Start, ...] = ("random", "linear")
 ErrorModel = Literal["likelihood", "paper", "none"]
 ERROR_MODELS: tuple[ErrorModel, ...] = ("likelihood", "paper", "none")
 HERMITE = 5  # points for the expectation over one output of the error network
+MOST_DECAY = 1e12  # far more than leaves any slope; training squares it in single precision
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ class StochasticNetwork(LearnedModel):
         self.writes = checked_sizes(writes, f"{self.name}: writes")
         self.error = checked_option(error, ERROR_MODELS, f"{self.name}: error")
         self.start = checked_option(start, STARTS, f"{self.name}: start")
-        self.decay = checked_number(decay, f"{self.name}: decay")
+        self.decay = checked_number(decay, f"{self.name}: decay", MOST_DECAY)
         sizes = (sum(self.reads.values()), *self.hidden, sum(self.writes.values()))
         self._mean = Perceptron(sizes, f"{self.name}_mean")
         self._error = Perceptron(sizes, f"{self.name}_error")

@@ -12,6 +12,7 @@ from symgraph.slots import Array
 
 Try = tuple[Array, Mapping[str, str]]  # a situation (n,), NaN where it is not known, and {selection: choice} made in it
 SMALLEST_SPREAD = 1e-9  # standard deviation over the largest number, up to which it is rounding error
+FAR = 1e150  # standard deviations beyond which all is equally far: the square is still a number
 
 
 def situation_of(graph: Graph, labels: Iterable[str], known: Known, at_start: Known) -> Array:
@@ -51,10 +52,11 @@ def least_known(selection: str, choices: Sequence[str], situation: Array, tries:
     made = [choices_made.get(selection) for _, choices_made in tries]
     seen = np.array([where for where, _ in tries])
     largest = np.fmax.reduce(np.abs(seen))  # passes over NaN
-    unit = np.where(largest > 0.0, largest, 1.0)  # in which no square overflows
+    unit = np.where(largest > 0.0, largest, 1.0)  # in which no deviation's square overflows
     sd = unit * np.ma.masked_invalid(seen / unit).std(axis=0).filled(0.0)
     tells = (sd > SMALLEST_SPREAD * unit) & ~np.isnan(situation)
-    offsets = (seen[:, tells] - situation[tells]) / sd[tells]
+    with np.errstate(over="ignore"):
+        offsets = np.clip((seen[:, tells] - situation[tells]) / sd[tells], -FAR, FAR)
     squares = np.where(np.isnan(offsets), 2.0, offsets**2).sum(axis=1)
     # Logarithms tell tries apart however far they are; sorted, equal ones count the same to the last bit.
     counted = {

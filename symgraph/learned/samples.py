@@ -18,7 +18,6 @@ from symgraph.graph import Branch, Graph, Group
 from symgraph.learned.branches import BranchNetwork
 from symgraph.learned.knowledge import Knowledge, Known, branches_to, column_of
 from symgraph.learned.records import Visit
-from symgraph.learned.storage import REMEDY
 from symgraph.slots import Array
 
 # What a model that can be fitted must have beside `fit`, `reads`, `writes` and `propagate`.
@@ -80,6 +79,9 @@ class Lessons:
                     f"{bound.place} has a method 'fit' but no {(lacks or ['parameters'])[0]!r}; see StochasticNetwork, "
                     f"or take 'fit' away to use it as it is"
                 )
+            for spread in getattr(model, "spreads", ()):
+                if not any(spread is parameter for parameter in model.parameters):
+                    raise InputError(f"{bound.place}: its 'spreads' hold {spread!r}; give some of its 'parameters'")
             reads += bound.reads
             known = self.all.setdefault(model.name, Lesson(model))
             if known.model.parameters[0] is not model.parameters[0]:  # a view under another rule shares its weights
@@ -106,10 +108,10 @@ class Lessons:
             try:
                 lesson.model.restore(self.file_of(name))
             except StorageError as error:
-                what, damaged, _ = str(error).partition(f"; {REMEDY}")
-                if not damaged:
+                if not error.damage:
                     raise
-                raise StorageError(f"{what}; delete the file, and the loop fits the model to its episodes") from None
+                remedy = "delete the file, and the loop fits the model to its episodes"
+                raise StorageError(f"{error.damage}; {remedy}") from None
 
     def check_seen(self) -> None:
         """Fit anew the models whose file has seen more samples than there are; raise InputError where others have.

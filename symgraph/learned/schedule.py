@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from symgraph.errors import InputError
+from symgraph.learned.inputs import checked_number
 from symgraph.learned.records import shown
 
 
@@ -69,10 +70,7 @@ class Exploration:
 
     def __post_init__(self) -> None:
         for name, most in (("selections", 1.0), ("actions", 1.0), ("noise", 1.0), ("episodes", math.inf)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float, np.integer)) or not 0 <= value <= most:
-                wanted = "of at least 0" if math.isinf(most) else f"from 0 to {most:g}"
-                raise InputError(f"Exploration: {name} = {value!r}; give a number {wanted}")
+            checked_number(getattr(self, name), f"Exploration: {name}", most)
 
     @property
     def explores(self) -> bool:

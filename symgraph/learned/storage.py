@@ -139,7 +139,7 @@ def _checked(path: Path, file: BinaryIO, kind: str, expected: Callable[[Document
     """Return a file's bytes and its document; nothing large is read before all lengths agree."""
     size = os.fstat(file.fileno()).st_size
     if size > MOST_BYTES:
-        raise StorageError(f"{path} has {size} bytes, more than the {MOST_BYTES} of any model; {REMEDY}")
+        raise damaged(path, f"it has {size} bytes, more than the {MOST_BYTES} of any model")
     start = file.read(8)
     header_size = int.from_bytes(start, "little")
     if len(start) < 8 or header_size > size - 8:
@@ -250,7 +250,10 @@ def checked_path(path: Any) -> Path:
 
 def damaged(path: str | os.PathLike[str], what: str) -> StorageError:
     """Return the error of a file that says what cannot be."""
-    return StorageError(f"{path}: {_short(what)}; {REMEDY}")
+    damage = f"{path}: {_short(what)}"
+    error = StorageError(f"{damage}; {REMEDY}")
+    error.damage = damage
+    return error
 
 
 def _short(text: str) -> str:
