@@ -52,8 +52,8 @@ def test_same_seed_same_weights_and_other_seed_other_weights():
     assert not all(np.array_equal(a, b) for a, b in zip(fits[0], fits[2], strict=True))
 
 
-def test_decay_holds_back_what_noise_would_bend():
-    """Sixty samples with ten inputs, of which one bends: what is learned of the others is noise."""
+def test_with_decay_a_bend_is_learned_before_noise_is():
+    """Sixty samples with ten inputs, of which one bends: without decay noise in the others ends a fit at its start."""
     rng = np.random.default_rng(0)
     x = rng.standard_normal((1060, 10))
     truth = np.abs(x[:, :1])
@@ -63,7 +63,8 @@ def test_decay_holds_back_what_noise_would_bend():
         one = StochasticNetwork({"x": 10}, {"y": 1}, (32,), error="none", start="linear", decay=decay)
         one.fit(x[:60], y, progress=False)
         wrong[decay] = np.sqrt(np.mean((one.predict(x[60:])[0] - truth[60:]) ** 2))
-    assert wrong[3.0] < 0.9 * wrong[0.0] < truth.std()
+    assert wrong[3.0] < 0.7 * truth.std()
+    assert wrong[0.0] > 0.9 * truth.std()
 
 
 def test_fit_is_warm_until_the_samples_have_grown_by_half():

@@ -61,10 +61,10 @@ def test_command_of_those_who_came_by_make(run, monkeypatch):
     assert 'make pour ARGS="--resume --output output/pour" goes on with it' in run().output
 
 
-def test_unfinished_run_is_named_and_left_alone(run, tmp_path):
+def test_run_that_is_there_is_named_and_left_alone(run, tmp_path):
     run("--seed", 1)
     again = run("--seed", 2)
-    assert "output/pour is unfinished (0 of 80 episodes)" in again.output
+    assert "output/pour is taken (0 of 80 episodes)" in again.output
     assert "All is kept in output/pour-2;" in again.output
     assert json.loads((tmp_path / "output/pour/options.json").read_text())["seed"] == 1
     for number in range(80):
@@ -72,8 +72,8 @@ def test_unfinished_run_is_named_and_left_alone(run, tmp_path):
             store.begin(number, "general", 0, {})
             store.end(number, "done", total=0.0)
     later = run("--seed", 2)
-    assert "output/pour is unfinished" not in later.output
-    assert "output/pour-2 is unfinished" in later.output
+    assert "output/pour is taken (80 of 80 episodes)" in later.output
+    assert "output/pour-2 is taken (0 of 80 episodes)" in later.output
     assert "All is kept in output/pour-3;" in later.output
 
 
@@ -99,3 +99,13 @@ def test_refusal_names_option_and_value(run, tmp_path, words, told):
         assert part in refused.output
     assert "Traceback" not in refused.output
     assert len(refused.output.splitlines()) <= 6
+
+
+@pytest.mark.parametrize("text", ["", '{"seed": 1', "[1]"])
+def test_options_that_are_damaged(run, tmp_path, text):
+    run("--output", "kept")
+    (tmp_path / "kept/options.json").write_text(text)
+    for words in (["--resume"], []):
+        refused = run(*words, "--output", "kept")
+        assert refused.exit_code == 2
+        assert "kept/options.json holds no options of a run; give another --output, or take it away" in refused.output

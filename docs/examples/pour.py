@@ -225,15 +225,13 @@ def pour(folder, options):
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     try:
         with Progress(*columns, console=console) as progress, loop_in(world, name, options, folder) as loop:
-            for path in pictures if loop.done < loop.episodes else ():
+            for path in pictures:  # of a run that is gone on with
                 path.unlink(missing_ok=True)
             learn(loop, progress)
-            if not curve.exists():
-                draw_curve(loop, curve)
+            draw_curve(loop, curve)
             shown = prove(loop, world, progress)
-            if not skill_map.exists():
-                draw_map(loop, setup, options.get("target", 0.3), skill_map, progress)
-            if shown and not film.exists():
+            draw_map(loop, setup, options.get("target", 0.3), skill_map, progress)
+            if shown:
                 films = [world.film(attempt) for attempt in progress.track(shown, description="filming")]
                 write_video(film, list(itertools.chain(*films)), fps=8)
     except KeyboardInterrupt:
@@ -245,14 +243,22 @@ def pour(folder, options):
 
 def kept(folder):
     path = folder / OPTIONS
-    return json.loads(path.read_text()) if path.exists() else {}
+    if not path.exists():
+        return {}
+    try:
+        return DEFAULTS | json.loads(path.read_text())
+    except (ValueError, TypeError):
+        raise sg.InputError(f"{path} holds no options of a run; give another --output, or take it away") from None
 
 
 def keep(folder, options):
-    folder.mkdir(parents=True, exist_ok=True)
     new = folder / f"{OPTIONS}.new"
-    new.write_text(json.dumps(options))
-    new.replace(folder / OPTIONS)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        new.write_text(json.dumps(options))
+        new.replace(folder / OPTIONS)
+    except OSError as error:
+        raise sg.InputError(f"--output {folder}: {error.strerror}; give another folder") from None
 
 
 def done_in(folder):
@@ -288,8 +294,8 @@ def unused(folder):
         options = kept(one)
         if not options and not (one / "episodes.sqlite").exists():
             break
-        if options and (done := done_in(one)) < options["episodes"]:
-            print(f"{one} is unfinished ({done} of {options['episodes']} episodes); {resuming(one)} goes on with it")
+        if options:
+            print(f"{one} is taken ({done_in(one)} of {options['episodes']} episodes); {resuming(one)} goes on with it")
     return one
 
 
@@ -315,8 +321,8 @@ def main(
     try:
         folder, options = (output, resumed(output, asked)) if resume else (unused(output), DEFAULTS | asked)
         pour(folder, options)
-    except (sg.SymgraphError, OSError) as error:
-        typer.echo(error if isinstance(error, sg.SymgraphError) else f"--output {output}: {error}", err=True)
+    except sg.SymgraphError as error:
+        typer.echo(error, err=True)
         raise typer.Exit(2) from None
 
 

@@ -94,8 +94,9 @@ class StochasticNetwork(LearnedModel):
         start: where a fit from scratch begins: "random" (default) weights, or "linear", the ridge regression that
             predicts best the samples that were left out: better where samples are few and inputs many, worse where
             outliers lie far from all others.
-        decay: λ of weight decay: for each output the mean network minimises Σ error² + λ ‖weights‖², both in standard
-            deviations, and does not stop early; 0 (default): it stops where held-out samples are predicted best.
+        decay: λ of weight decay: the mean network minimises Σ error² + λ Σ weight², errors of all samples and outputs
+            in standard deviations, weights but for biases and what only hands a linear start on, and does not stop
+            early; 0 (default): it stops where held-out samples are predicted best.
         samples_needed: with fewer, plans that need the network explore.
         resolution: {label: standard deviation, a number or one for each element} up to which an input is taken for a
             constant that carries noise, of which nothing is learned; 0 where left out [units of the inputs].

@@ -26,7 +26,7 @@ class EpisodeReport:
         value: that the last plan promised; while the stage explores, as if learned models were certain, and so is
             `expected`.
         explored: why the last decision was not the best plan, "drawn: selections, actions" or "exploring: …"; empty if
-            it was, but for noise.
+            it was, but for noise. While the stage explores, best is what is best as if learned models were certain.
         known: {label: value} of all that was observed, decided or follows from it, the latest.
         seconds: {"simulating", "planning", "fitting": time} [s].
     """

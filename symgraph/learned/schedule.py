@@ -91,8 +91,8 @@ class Stage:
         name: under which its episodes are stored; no two stages of a loop share one.
         world: where they happen, see `World`.
         episodes: how many.
-        explore: how much is tried, `Exploration()` if left out, which draws nearly everything at first; nothing
-            with `Exploration(episodes=0)`. Counts the episodes of this stage.
+        explore: how much is tried, `Exploration()` if left out, which draws all actions at first and two selections
+            in five; nothing with `Exploration(episodes=0)`. Counts the episodes of this stage.
         given: {label: value} of states that the world's `reset` does not observe, or a function of the stage's episode,
             from 0 on, that returns it: reward shaping gives, say, a bonus that ends after ten episodes.
 

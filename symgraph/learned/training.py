@@ -1,7 +1,8 @@
 """Training: several copies of a network side by side, one on all samples and others that each leave a fold out.
 
-The copies that leave samples out say how well the network predicts what it has not seen: they decide when to stop, and
-their errors are what an error model must learn, since errors on the training samples themselves are far too small.
+The copies that leave samples out say how well the network predicts what it has not seen: they decide when to stop, unless
+weights decay, and their errors are what an error model must learn, since errors on the training samples themselves are far
+too small.
 """
 
 from __future__ import annotations
@@ -136,10 +137,11 @@ def train(
     decay: float = 0.0,
     linear: bool = False,
 ) -> Training:
-    """Minimise a loss by Adam with a falling rate, all copies in one step, and keep the best weights on the way.
+    """Minimise a loss by Adam with a falling rate, all copies in one step.
 
-    With a decay λ the loss of a copy is mean loss + λ ‖w‖² / (m N), with N samples and m outputs: for squares, the most
-    probable weights under a Gaussian prior. The last weights are kept then: λ is what keeps noise out of them.
+    Without decay the weights are kept that predict held-out samples best on the way. With a decay λ the loss of a copy
+    is mean loss + λ ‖w‖² / (m N), with N samples and m outputs: for squares, the most probable weights under a Gaussian
+    prior. The last weights are kept then: λ is what keeps noise out of them.
 
     Gradients go back through the layers by hand: with few samples an automatic one costs several times the sums.
 
