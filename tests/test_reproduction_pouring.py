@@ -92,9 +92,9 @@ def test_runs_are_killed_gone_on_with_built_upon_evaluated_and_drawn(tmp_path):
 
 def test_an_attempt_without_a_loop_is_paid_as_in_a_loop(tmp_path):
     from baselines import episode
-    from setups import SETUPS, Run, chosen
+    from setups import Run, chosen
 
-    from sims.pouring import PouringWorld
+    from sims.pouring import SETUPS, PouringWorld
 
     (condition,) = chosen(["setup1/PT0-Rtip"], 1)
     for number in range(3, 30):
@@ -120,9 +120,8 @@ def test_an_attempt_without_a_loop_is_paid_as_in_a_loop(tmp_path):
 
 def test_a_situation_comes_again_with_other_noise():
     from baselines import same_situation
-    from setups import SETUPS
 
-    from sims.pouring import PouringWorld
+    from sims.pouring import SETUPS, PouringWorld
 
     world = PouringWorld(**SETUPS["varied"])
     seen = world.reset(5)

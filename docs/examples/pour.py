@@ -36,22 +36,10 @@ from typer import Option
 
 import symgraph as sg
 from models import pouring
-from sims.pouring import MATERIALS, PouringWorld
+from sims.pouring import MATERIALS, SETUPS, PouringWorld
 from sims.pouring.behaviour import SPHERE_AMOUNT, SPILL_AMOUNT
 from sims.pouring.rendering import RecordedWorld, write_video
 
-SETUPS = {
-    "general": {"material": list(MATERIALS), "mouth": (0.11, 0.25), "target": 0.3},
-    "setup1": {"material": "bnc", "mouth": 0.23, "target": 0.3},
-    "setup2": {"material": "vsc", "mouth": 0.13, "target": 0.3},
-    "varied": {
-        "material": list(MATERIALS),
-        "blend": True,
-        "mouth": (0.11, 0.25),
-        "target": (0.1, 0.4),
-        "receiver_size": ((0.22, 0.38), 0.4, (0.14, 0.22)),
-    },
-}
 PROOFS = 6  # situations at the end that it has never met
 EXPLORED = 50  # episodes in which it tries something beside its plans
 

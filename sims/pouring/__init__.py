@@ -11,12 +11,14 @@ from sims.pouring.actions import ACTIONS, SKILLS, Clamp
 from sims.pouring.behaviour import End
 from sims.pouring.episode import Episode, run_episode, run_episodes
 from sims.pouring.materials import MATERIALS, Material, mix
+from sims.pouring.setups import SETUPS
 from sims.pouring.simulation import SimulationFailed
 from sims.pouring.world import PouringWorld
 
 __all__ = [
     "ACTIONS",
     "MATERIALS",
+    "SETUPS",
     "SKILLS",
     "Clamp",
     "End",

@@ -1,8 +1,8 @@
 """Training: several copies of a network side by side, one on all samples and others that each leave a fold out.
 
-The copies that leave samples out say how well the network predicts what it has not seen: they decide when to stop, unless
-weights decay, and their errors are what an error model must learn, since errors on the training samples themselves are far
-too small.
+The copies that leave samples out say how well the network predicts what it has not seen: they decide when to stop,
+unless weights decay, and their errors are what an error model must learn, since errors on the training samples
+themselves are far too small.
 """
 
 from __future__ import annotations

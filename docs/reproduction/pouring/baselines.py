@@ -20,11 +20,11 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from processes import display, work
-from setups import CONDITIONS, FOLDER, FRESH, LAST, OUTCOME, SETUPS, append, outcome, read, rounded, seed_of, write
+from setups import CONDITIONS, FOLDER, FRESH, LAST, OUTCOME, append, outcome, read, rounded, seed_of, write
 
 import symgraph as sg
 from models import pouring
-from sims.pouring import ACTIONS, SKILLS, PouringWorld
+from sims.pouring import ACTIONS, SETUPS, SKILLS, PouringWorld
 from sims.pouring.world import RECEIVER_RANGE
 from symgraph.learned.execution import Execution, WorldFailed, returns_of
 from symgraph.learned.knowledge import Knowledge

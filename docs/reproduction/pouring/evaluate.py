@@ -14,9 +14,9 @@ from typing import Annotated, Any
 
 import typer
 from processes import display, work
-from setups import FOLDER, FRESH, OUTCOME, RUNS, SETUPS, Run, append, chosen, outcome, read, rounded, write
+from setups import FOLDER, FRESH, OUTCOME, RUNS, Run, append, chosen, outcome, read, rounded, write
 
-from sims.pouring import PouringWorld
+from sims.pouring import SETUPS, PouringWorld
 
 EVALUATION = FOLDER / "evaluation.csv"
 COLUMNS = (

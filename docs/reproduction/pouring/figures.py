@@ -19,9 +19,9 @@ mpl.rcParams["svg.hashsalt"] = "pouring"  # the same drawing gives the same file
 import matplotlib.pyplot as plt
 import numpy as np
 import typer
-from setups import CONDITIONS, FOLDER, LAST, SETUPS, TARGET, features_of, read, write
+from setups import CONDITIONS, FOLDER, LAST, features_of, read, write
 
-from sims.pouring import MATERIALS
+from sims.pouring import MATERIALS, SETUPS
 from sims.pouring.behaviour import SPHERE_AMOUNT, SPILL_AMOUNT
 
 Row = dict[str, str]
@@ -71,7 +71,7 @@ def figure_9(rows: list[Row]) -> plt.Figure:
     """The poured amount in SETUP1."""
     figure, axes = plt.subplots(figsize=(7, 3.5), layout="constrained")
     draw_curves(axes, rows, "setup1", ["PT0-Rnone", "PT0-Rtip"], "poured")
-    axes.axhline(TARGET, color="grey", linestyle=":")
+    axes.axhline(SETUPS["setup1"]["target"], color="grey", linestyle=":")
     axes.set_ylabel("poured amount")
     return figure
 

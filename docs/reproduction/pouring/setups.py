@@ -25,31 +25,17 @@ sys.path.insert(0, str(ROOT))
 
 import symgraph as sg
 from models import pouring
-from sims.pouring import MATERIALS, PouringWorld
+from sims.pouring import MATERIALS, SETUPS, PouringWorld
 from symgraph.learned import EpisodeStore, Exploration, OnlineLoop, Stage
 from symgraph.learned.episodes import Episode
 from symgraph.learned.execution import returns_of
 
 RUNS = ROOT / "output/reproduction/pouring"  # a folder per run, not committed
 RESULTS = FOLDER / "results.csv"
-TARGET = 0.3
 BONUS, BONUS_EPISODES = 10.0, 10  # the paper's reward shaping: for the favoured skill, in the first episodes of a stage
 LAST = 20  # episodes of a run that count as "after learning"
 SEEDS = 800  # of run 0, the next ones count from there: lower seeds served to find out what works
 FRESH = 10**6  # seeds of situations that no run meets: those of runs are spread over 32 bits
-
-SETUPS = {  # arguments of PouringWorld
-    "setup1": {"material": "bnc", "mouth": 0.23, "target": TARGET},
-    "setup2": {"material": "vsc", "mouth": 0.13, "target": TARGET},
-    "general": {"material": list(MATERIALS), "mouth": (0.11, 0.25), "target": TARGET},
-    "varied": {
-        "material": list(MATERIALS),
-        "blend": True,
-        "mouth": (0.11, 0.25),
-        "target": (0.1, 0.4),
-        "receiver_size": ((0.22, 0.38), 0.4, (0.14, 0.22)),
-    },
-}
 
 
 @dataclass(frozen=True)
