@@ -18,11 +18,14 @@ from symgraph.propagation import RULES
 from symgraph.slots import Array, Gaussian, Slot, State, as_covariance
 
 REWARD = "reward"  # the one thing a reward model returns
+REQUIREMENT = "requirement"  # likewise
+
+SINGLE = {REWARD: "a reward returns one scalar", REQUIREMENT: "a requirement returns a scalar or a column"}
 
 SCALAR_LIMIT = 50_000  # instructions up to which a model is written out scalar by scalar
 
 # The rule of a plain function that does not name one.
-DEFAULT_PROPAGATION = {"edge": "linear", "probability": "linear", "reward": "second-order"}
+DEFAULT_PROPAGATION = {"edge": "linear", "probability": "linear", "reward": "second-order", "requirement": "linear"}
 
 
 class BoundModel:
@@ -137,8 +140,8 @@ class BoundModel:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)  # numpy's functions work on CasADi's columns
             returned = self._function(**{name: kind(x[label]) for name, label in self._reads.items()})  # type: ignore[operator]  # no propagator
-        if not isinstance(returned, Mapping):
-            returned = {REWARD: returned}
+        if not isinstance(returned, Mapping):  # of a reward or a requirement
+            returned = dict.fromkeys(self._writes, returned)
         return x, {label: _column(returned[name], kind) for name, (label, _) in self._writes.items()}
 
     def _build_propagator(self, uncertain: tuple[str, ...]) -> ca.Function:
@@ -172,7 +175,7 @@ def bind(model: Any, slots: Mapping[str, Slot], role: str, place: str, branches:
     Args:
         model: a plain function, a `Model` or a `Propagator`.
         slots: the graph's slots.
-        role: "edge", "reward" or "probability".
+        role: "edge", "reward", "requirement" or "probability".
         place: where in the graph it stands, for messages.
         branches: the branches whose probabilities a probability model returns.
 
@@ -282,10 +285,10 @@ def _written_sizes(
                 f"{place} raised {type(error).__name__}: {said}. It is called once with CasADi columns named "
                 f"{names(reads)}: use CasADi functions (casadi.sin, casadi.if_else) and no Python branches on values"
             ) from error
-    if role == "reward":
+    if role in SINGLE:
         if isinstance(returned, Mapping):
-            raise GraphError(f"{place} returned a dict; a reward returns one scalar")
-        returned = {REWARD: returned}
+            raise GraphError(f"{place} returned a dict; {SINGLE[role]}")
+        returned = {role: returned}
     elif not isinstance(returned, Mapping):
         what = "a dict {slot: value}" if role == "edge" else "a dict {branch: probability}"
         got = "nothing" if returned is None else f"{type(returned).__name__} {_short(returned)}"
@@ -311,13 +314,15 @@ def _writes(
     model: Model, sizes: Mapping[str, int], slots: Mapping[str, Slot], role: str, place: str, branches: tuple[str, ...]
 ) -> dict[str, tuple[str, int]]:
     """Return {its own name: (label, size)} after checking names and sizes for the role."""
-    if role == "reward":
+    if role in SINGLE:
         if len(sizes) != 1:
-            raise GraphError(f"{place} writes {names(sizes)}; a reward is one scalar")
+            raise GraphError(f"{place} writes {names(sizes)}; {SINGLE[role]}")
         name, size = next(iter(sizes.items()))
-        if size != 1:
-            raise GraphError(f"{place} returned {size} elements; a reward is one scalar, e.g. casadi.sum1(…)")
-        return {name: (REWARD, 1)}
+        if size != 1 and role == REWARD:
+            raise GraphError(f"{place} returned {size} elements; {SINGLE[role]}, e.g. casadi.sum1(…)")
+        if size == 0:
+            raise GraphError(f"{place} returned nothing; {SINGLE[role]}")
+        return {name: (role, size)}
     if role == "probability":
         if set(sizes) != set(branches):
             raise GraphError(f"{place} returned the branches {names(sizes)}; the chance has {names(branches)}")

@@ -8,6 +8,9 @@ in every derivative. A product with a one-hot factor would evaluate them all, an
 
 Large trees are cut into such functions too. Subtrees of the same structure share one, so that a tree's code grows with
 the number of its different subtrees.
+
+The margins of requirements are written down on the way, from the leaves to the root like the values, but no probability
+weighs them.
 """
 
 from __future__ import annotations
@@ -20,7 +23,8 @@ from typing import Any
 
 import casadi as ca
 
-from symgraph.binding import REWARD, BoundModel
+from symgraph.binding import REQUIREMENT, REWARD, BoundModel
+from symgraph.constraints import Constraint, constraints_of, merit
 from symgraph.model import Parameter
 from symgraph.slots import Gaussian, State
 from symgraph.structure import Structure, is_open
@@ -81,21 +85,44 @@ def _stacked(name: str, sizes: Iterable[int]) -> tuple[ca.MX, list[ca.MX]]:
 
 @dataclass(frozen=True)
 class Expectation:
-    """The expected sum of rewards J as an expression of the inputs."""
+    """The expected sum of rewards J, and the margins of requirements, as expressions of the inputs.
+
+    Attributes:
+        inputs: what they depend on.
+        value: J (1, 1).
+        margins: (k, 1), a row for each of the constraints; `unused` where it does not count.
+        constraints: k of them.
+        flat: whether it is small enough for scalar code.
+    """
 
     inputs: Inputs
-    value: ca.MX  # (1, 1)
-    flat: bool  # small enough for scalar code
+    value: ca.MX
+    margins: ca.MX
+    constraints: tuple[Constraint, ...]
+    flat: bool
 
     def value_and_gradient(self) -> ca.Function:
         """Return the function inputs → J (1, 1), ∂J/∂actions (n, 1)."""
+        return self._with_gradient(self.value, self.inputs.symbols)
+
+    def merit_and_gradient(self) -> ca.Function:
+        """Return the function inputs, λ (k, 1), w (k, 1) → J - Σ penalties, its gradient (n, 1); see `merit`."""
+        multipliers, weights = (ca.MX.sym(name, len(self.constraints)) for name in ("multipliers", "weights"))
+        penalised = merit(self.value, self.margins, multipliers, weights, self.constraints)
+        return self._with_gradient(penalised, [*self.inputs.symbols, multipliers, weights])
+
+    def missed(self) -> ca.Function:
+        """Return the function inputs → margins (k, 1)."""
+        return ca.Function("margins", self.inputs.symbols, [ca.densify(self.margins)])
+
+    def _with_gradient(self, value: ca.MX, inputs: list[ca.MX]) -> ca.Function:
         if not self.flat:
-            gradient = ca.gradient(self.value, self.inputs.actions)
-            return ca.Function("objective", self.inputs.symbols, [self.value, gradient], {"cse": True})
-        flat = ca.Function("J", self.inputs.symbols, [self.value]).expand()
+            gradient = ca.gradient(value, self.inputs.actions)
+            return ca.Function("objective", inputs, [value, gradient], {"cse": True})
+        flat = ca.Function("J", inputs, [value]).expand()
         symbols = flat.sx_in()
-        value = flat.call(symbols)[0]
-        results = ca.cse([value, ca.gradient(value, symbols[0])])
+        expanded = flat.call(symbols)[0]
+        results = ca.cse([expanded, ca.gradient(expanded, symbols[0])])
         return ca.Function("objective", symbols, [ca.densify(r) for r in results])
 
     def hessian(self) -> ca.Function:
@@ -133,8 +160,10 @@ class _Writer:
                 for branch in group.branches:
                     if branch.child is not None and self._structure.apart[branch.child]:
                         self._write_function(branch, uncertain[node.index])
-        value, instructions = self._value(0, self._inputs.root)
-        return Expectation(self._inputs, ca.densify(value), instructions <= FLATTEN_LIMIT)
+        value, margins, instructions = self._value(0, self._inputs.root)
+        constraints = constraints_of(self._tree)
+        stacked = ca.vertcat(*margins) if margins else ca.MX(0, 1)
+        return Expectation(self._inputs, ca.densify(value), stacked, constraints, instructions <= FLATTEN_LIMIT)
 
     def _uncertain_labels(self) -> list[frozenset[str]]:
         found = [frozenset[str]()] * len(self._tree.nodes)
@@ -163,12 +192,13 @@ class _Writer:
             here[label] = Gaussian(mean, covariance)
             symbols += [mean] if covariance is None else [mean, covariance]
         written, own = _apply(branch.branch.model, here)
-        value, instructions = self._value(branch.child or 0, {**here, **written})
+        value, margins, instructions = self._value(branch.child or 0, {**here, **written})
+        results = [ca.densify(value), *([ca.densify(ca.vertcat(*margins))] if margins else [])]
         name = f"branch_{len(self._functions)}"
         inputs = symbols + self._shared_symbols
         # Nobody asks for derivatives by selections and weights, and the reverse sweep would compute them.
         follows = [True] * (len(symbols) + 1) + [False] * (len(self._shared_symbols) - 1)
-        function = ca.Function(name, inputs, [ca.densify(value)], {"cse": True, "is_diff_in": follows})
+        function = ca.Function(name, inputs, results, {"cse": True, "is_diff_in": follows})
         if own + instructions <= FLATTEN_LIMIT:
             function = function.expand()
         self._functions[key] = function
@@ -192,15 +222,20 @@ class _Writer:
         inputs = self._inputs
         return [inputs.actions, inputs.selections, *(parameter.symbol for parameter in inputs.parameters)]
 
-    def _value(self, root: int, dictionary: Dictionary) -> tuple[ca.MX, float]:
-        """Write the value of a subtree up to the branches that stand apart; also count scalar instructions."""
+    def _value(self, root: int, dictionary: Dictionary) -> tuple[ca.MX, list[ca.MX], float]:
+        """Write the value and the margins of a subtree, up to the branches that stand apart; count instructions too."""
         instructions = 0.0
         dictionaries = {root: dictionary}
         order = [root]  # grows while it is walked
-        terms: dict[int, list[tuple[ca.MX | float, ca.MX | int]]] = {}  # node → (probability, value or child)
+        terms: dict[int, list[tuple[ca.MX | float, list[ca.MX] | int]]] = {}  # node → (probability, results or child)
+        margins: dict[int, list[ca.MX]] = {}
         for index in order:
             here = dictionaries.pop(index)
-            terms[index] = []
+            terms[index], margins[index] = [], []
+            for requirement in self._tree.nodes[index].requirements:
+                outcome, count = _apply(requirement.model, here)
+                instructions += count
+                margins[index] += requirement.margins(outcome[REQUIREMENT])
             for group in self._tree.nodes[index].groups:
                 if is_open(group):
                     instructions = math.inf
@@ -216,12 +251,12 @@ class _Writer:
                     if branch.child is not None and self._structure.apart[branch.child]:
                         instructions = math.inf
                         function, arguments = self._call(branch, here)
-                        terms[index].append((probability, function.call(arguments)[0]))
+                        terms[index].append((probability, function.call(arguments)))
                         continue
                     written, count = _apply(branch.branch.model, here)
                     instructions += count + 2
                     if branch.child is None:
-                        terms[index].append((probability, written[REWARD].mean))
+                        terms[index].append((probability, [written[REWARD].mean]))
                     else:
                         dictionaries[branch.child] = {**here, **written}
                         order.append(branch.child)
@@ -230,33 +265,34 @@ class _Writer:
         for index in reversed(order):
             total = ca.MX(self._tree.cut_value if self._tree.nodes[index].cut else 0.0)
             for probability, term in terms[index]:
-                value = values.pop(term) if isinstance(term, int) else term
+                value, *below = [values.pop(term), *margins.pop(term)] if isinstance(term, int) else term
                 certain = isinstance(probability, float) and probability == 1.0
                 total = total + (value if certain else probability * value)
+                margins[index] += below
             values[index] = total
-        return values[root], instructions
+        return values[root], margins[root], instructions
 
-    def _switch(self, group: TreeGroup, here: Dictionary) -> ca.MX:
+    def _switch(self, group: TreeGroup, here: Dictionary) -> list[ca.MX]:
         """Write a choice: the function of the selected branch, the others not evaluated."""
         slot = self._tree.graph.selections()[str(group.group.selection)]
         calls = [self._call(branch, here) for branch in group.branches]  # in the order of the slot's choices
         if len(calls) == 1:
-            return calls[0][0].call(calls[0][1])[0]
-        # All cases of a switch take the same arguments: those that any of them needs.
+            return calls[0][0].call(calls[0][1])
+        # All cases of a switch take the same arguments: those that any of them needs. And all return the margins of all
+        # branches, in which those of the others do not count.
         arguments = {argument.__hash__(): argument for _, given in calls for argument in given}
         symbols = {key: ca.MX.sym("x", argument.sparsity()) for key, argument in arguments.items()}
-        cases = [
-            ca.Function(
-                f"case_{function.name()}",
-                list(symbols.values()),
-                function.call([symbols[argument.__hash__()] for argument in given]),
-            )
-            for function, given in calls
-        ]
+        unused = [[one.unused for one in constraints_of(self._tree, branch.child or 0)] for branch in group.branches]
+        cases = []
+        for i, (function, given) in enumerate(calls):
+            value, *margins = function.call([symbols[argument.__hash__()] for argument in given])
+            before, after = ([ca.MX(ca.DM(part)) for part in parts] for parts in (unused[:i], unused[i + 1 :]))
+            stacked = [ca.densify(ca.vertcat(*before, *margins, *after))] if any(unused) else []
+            cases.append(ca.Function(f"case_{function.name()}", [*symbols.values()], [value, *stacked]))
         selection = self._inputs.root[str(group.group.selection)].mean
         index = ca.dot(selection, ca.DM(range(slot.size)))
         switch = ca.Function.conditional("choice", cases[:-1], cases[-1])
-        return switch.call([index, *arguments.values()])[0]
+        return switch.call([index, *arguments.values()])
 
 
 def _apply(model: BoundModel | None, here: Dictionary) -> tuple[Dictionary, float]:

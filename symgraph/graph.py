@@ -11,6 +11,7 @@ from symgraph.binding import BoundModel, bind
 from symgraph.drawing import Diagram, DiagramEdge, DiagramNode, NodeKind
 from symgraph.errors import GraphError, did_you_mean, names
 from symgraph.model import Model, Propagator
+from symgraph.requirement import Requirement, requirement
 from symgraph.slots import Action, Selection, Slot, State
 
 Kind = Literal["edge", "choose", "chance", "reward"]
@@ -60,6 +61,7 @@ class Graph:
         self.slots: dict[str, Slot] = dict(slots)
         self.start = _node(start, "start")
         self.groups: dict[str, list[Group]] = {}  # source → its groups, in the order of the calls
+        self.requirements: dict[str, list[Requirement]] = {}  # source → what must hold there
 
     def edge(self, source: str, target: str, model: Any = None) -> None:
         """Add a group with the one branch source → target; without a model nothing changes on the way."""
@@ -131,6 +133,28 @@ class Graph:
         bound = bind(model, self.slots, "reward", f"node {source!r}, reward")
         self._add(source, Group("reward", (Branch("", None, bound),)))
 
+    def require(
+        self, source: str, model: Any, low: Any = -math.inf, high: Any = math.inf, confidence: float | None = None
+    ) -> None:
+        """Add a requirement: low ≤ what the model returns ≤ high, wherever the chosen branches lead to a node.
+
+        It counts there whatever the probability, but not where a branch is cut. Plans that meet all requirements come
+        before all others; `plan.violation` says by how much one is missed.
+
+        Args:
+            source: the node.
+            model: returns a scalar or a column, checked element by element; its default propagation is "linear".
+            low: a number, or one for each element [unit of what the model returns].
+            high: likewise; equal ones demand equality.
+            confidence: probability with which each finite side must hold under the Gaussian, mean ± quantile · sd; if
+                left out, the mean must lie between the bounds.
+        """
+        source = _node(source, "source")
+        place = f"node {source!r}, requirement"
+        bound = bind(model, self.slots, "requirement", place)
+        checked = requirement(bound, low, high, confidence, bound.place)
+        self.requirements.setdefault(source, []).append(checked)
+
     @property
     def nodes(self) -> list[str]:
         """All nodes in the order in which they were first named, the start first."""
@@ -138,7 +162,7 @@ class Graph:
         for source, groups in self.groups.items():
             found[source] = None
             found.update({branch.target: None for group in groups for branch in group.branches if branch.target})
-        return list(found)
+        return list({**found, **dict.fromkeys(self.requirements)})
 
     def selections(self) -> dict[str, Selection]:
         """Return the slots that are selections, in their order."""
@@ -173,7 +197,8 @@ class Graph:
         for name in self.nodes:
             kind: NodeKind
             kind = "start" if name == self.start else "node" if name in self.groups else "terminal"
-            nodes.append(DiagramNode(key=name, lines=(name,), kind=kind))
+            demands = tuple(line for one in self.requirements.get(name, ()) for line in one.lines)
+            nodes.append(DiagramNode(key=name, lines=(name, *demands), kind=kind))
             for g, group in enumerate(self.groups.get(name, ())):
                 for branch in group.branches:
                     target = branch.target

@@ -12,7 +12,8 @@ import numpy as np
 
 from symgraph.compile import make_kernel
 from symgraph.compile.interpreted import FlatFunction
-from symgraph.compile.kernel import Kernel
+from symgraph.compile.kernel import BoundKernel, Kernel
+from symgraph.constraints import violations
 from symgraph.errors import InputError, SlotError, did_you_mean, names
 from symgraph.expectation import Expectation, expected_value
 from symgraph.outcomes import ModelNumbers, Moments, NodeOutcomes, walk
@@ -49,9 +50,15 @@ class Build:
         return FlatFunction(self.expectation.hessian())
 
     @cached_property
+    def margins(self) -> FlatFunction:
+        """inputs → by how much constraints are missed (k, 1), in CasADi's interpreter."""
+        return FlatFunction(self.expectation.missed())
+
+    @cached_property
     def kernel(self) -> Kernel:
-        """Value and gradient at many points, compiled where that is possible."""
-        return make_kernel(self.function, self._compiled)
+        """Value and gradient at many points, compiled where that is possible; of the merit if there are constraints."""
+        constrained = bool(self.expectation.constraints)
+        return make_kernel(self.expectation.merit_and_gradient() if constrained else self.function, self._compiled)
 
     @property
     def has_kernel(self) -> bool:
@@ -72,6 +79,21 @@ class Situation:
         """The inputs after actions and selections, with the parameters' values of this moment."""
         parameters = self.build.expectation.inputs.parameters
         return [self.means, self.covariances, *(p.value.ravel(order="F") for p in parameters)]
+
+    def bind(
+        self, low: Array, high: Array, multipliers: Array | None = None, weights: Array | None = None
+    ) -> BoundKernel:
+        """Return the kernel at this state.
+
+        Args:
+            low: (n,) bounds of the actions.
+            high: likewise.
+            multipliers: (k,) of the constraints, 0 if left out: with weights of 0 they have no part in the value.
+            weights: (k,) likewise.
+        """
+        nothing = np.zeros(len(self.build.expectation.constraints))
+        pulls = [nothing if given is None else given for given in (multipliers, weights)] if nothing.size else []
+        return self.build.kernel.bind([*self.shared, *pulls], low, high)
 
 
 class Objective:
@@ -94,6 +116,7 @@ class Objective:
         self.graph = tree.graph
         self._compiled = compiled
         self._builds: dict[frozenset[str], Build] = {}
+        self._chosen: dict[tuple[str, ...], Objective] = {}
         self._models = ModelNumbers()
 
     def value(
@@ -134,6 +157,22 @@ class Objective:
         columns = [self.stack_actions(actions), self.one_hot(selections), *situation.shared]
         return situation.build.hessian(columns)[0].reshape(self.n_actions, self.n_actions)
 
+    def violation(
+        self,
+        state: Mapping[str, Any],
+        actions: Mapping[str, Any] | None = None,
+        selections: Mapping[str, str] | None = None,
+    ) -> float:
+        """Return the largest breach of a requirement in the unit of its model, 0 if all are met; see `value`."""
+        situation = self.situation(state)
+        missed = self.missed(situation, self.stack_actions(actions), self.one_hot(selections))
+        return float(missed.max(initial=0.0))
+
+    def missed(self, situation: Situation, actions: Array, hot: Array) -> Array:
+        """Return by how much each constraint is missed (k,), each at least 0, at stacked actions and selections."""
+        (margins,) = situation.build.margins([actions, hot, *situation.shared])
+        return violations(margins, situation.build.expectation.constraints)
+
     def evaluate(
         self, state: Mapping[str, Any], points: Any, selections: Mapping[str, str] | None = None
     ) -> tuple[Array, Array]:
@@ -158,7 +197,7 @@ class Objective:
                 f"points has shape {columns.shape}; give ({n}, P): the {n} stacked actions, a column per point"
             )
         chosen = np.tile(self.one_hot(selections), (columns.shape[1], 1))
-        values, gradients = situation.build.kernel.bind(situation.shared, *self.bounds).evaluate(columns.T, chosen)
+        values, gradients = situation.bind(*self.bounds).evaluate(columns.T, chosen)
         return values, gradients.T
 
     def outcomes(
@@ -187,7 +226,15 @@ class Objective:
             yield label, np.array([float(choice == selections[label]) for choice in slot.choices])
 
     def __getstate__(self) -> dict[str, Any]:  # what is derived from the tree does not travel; it is built anew
-        return {**self.__dict__, "_builds": {}, "_models": ModelNumbers()}
+        return {**self.__dict__, "_builds": {}, "_chosen": {}, "_models": ModelNumbers()}
+
+    def chosen(self, selections: Mapping[str, str]) -> Objective:
+        """Return the objective of the tree without the branches that selections rule out."""
+        key = tuple(selections[label] for label in self.graph.selections())
+        if key not in self._chosen:
+            tree = self.tree.chosen(selections)
+            self._chosen[key] = self if len(tree.nodes) == len(self.tree.nodes) else Objective(tree, self._compiled)
+        return self._chosen[key]
 
     @cached_property
     def n_actions(self) -> int:

@@ -50,6 +50,7 @@ class Plan:
         actions: {label: float or (size,)} [unit].
         selections: {label: choice}.
         value: the expected sum of rewards.
+        violation: the largest breach of a requirement, in the unit of its model; 0 if all are met.
         status: what is known: "converged", "best of N starts", "exploring: model 'm' has 2 of 3 samples", …
         notes: what makes the value less than it seems, e.g. paths that are cut.
         nodes: the outcome at every tree node, in tree order.
@@ -63,6 +64,7 @@ class Plan:
     actions: dict[str, Any]
     selections: dict[str, str]
     value: float
+    violation: float
     status: str
     notes: tuple[str, ...]
     nodes: Sequence[NodeOutcome]
@@ -99,6 +101,7 @@ class Plan:
             "actions": _plain(self.actions),
             "selections": dict(self.selections),
             "value": self.value,
+            "violation": self.violation,
             "status": self.status,
             "notes": list(self.notes),
             "nodes": [

@@ -12,11 +12,14 @@ from symgraph.binding import BoundModel
 from symgraph.errors import InputError, SolveError, did_you_mean, names
 from symgraph.exploration import Decisions, explore, lacking_models, met
 from symgraph.objective import Objective, Situation, check_choice, checked_column, stacked_index
+from symgraph.optimizers.constrained import MET, Constrained
 from symgraph.optimizers.lbfgs import Lbfgs
 from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
 from symgraph.plan import Plan, PlanRun
 from symgraph.progress import Progress
-from symgraph.slots import Action, Selection, State
+from symgraph.slots import Action, Array, Choices, Selection, State
+
+MOST_TOLD = 8  # requirements that a plan says to be missed
 
 Guess = Plan | Mapping[str, Any]
 
@@ -31,11 +34,12 @@ def solve(
     seed: int = 0,
     progress: bool = True,
 ) -> Plan:
-    """Find the actions and selections with the highest expected sum of rewards.
+    """Find the actions and selections with the highest expected sum of rewards that meet all requirements.
 
-    The first call compiles the objective (a fraction of a second to a minute, kept on disk); later ones only search.
-    While a learned model that the plan could meet has too few samples, the plan is a random one that leads to it, and
-    its status begins with "exploring".
+    Where no plan meets them, the one that misses least, relative to how much they vary over the bounds; its status says
+    what is missed. The first call compiles the objective (a fraction of a second to a minute, kept on disk); later ones
+    only search. While a learned model that the plan could meet has too few samples, the plan is a random one that leads
+    to it, and its status begins with "exploring".
 
     Args:
         objective: what to maximise.
@@ -76,15 +80,25 @@ def solve(
         if search.interrupted:
             raise KeyboardInterrupt
         raise SolveError(_why_not_finite(objective, situation, search))
-    chosen = _selections(objective, best)
+    chosen = _names(objective, best.choices)
     nodes = objective.outcomes_of(situation, best.point, chosen)
+    missed = objective.missed(situation, best.point, objective.one_hot(chosen))
+    status = f"interrupted: best of {len(search.runs)} runs" if search.interrupted else search.status
+    if best.missed > MET:
+        status = f"requirements are missed: {_told(objective, situation, missed)[0]}; {status}"
     planned_or_seen: dict[str, Action | State] = {**objective.graph.actions(), **objective.graph.states()}
     return Plan(
         actions=objective.unstack(best.point),
         selections=chosen,
         value=best.value,
-        status=f"interrupted: best of {len(search.runs)} runs" if search.interrupted else search.status,
-        notes=(*_held_outside(objective, fixed or {}), *nodes.notes(), *([] if explores else _seldom(lacking))),
+        violation=float(missed.max(initial=0.0)),
+        status=status,
+        notes=(
+            *(_told(objective, situation, missed)[1:MOST_TOLD] if best.missed > MET else ()),
+            *_held_outside(objective, fixed or {}),
+            *nodes.notes(),
+            *([] if explores else _seldom(lacking)),
+        ),
         nodes=nodes,
         runs=_Runs(objective, search.runs),
         optimizer="uniform draw" if explores else type(optimizer).__name__,
@@ -92,6 +106,13 @@ def solve(
         seconds=time.perf_counter() - begin,
         units={label: slot.unit for label, slot in planned_or_seen.items() if slot.unit},
     )
+
+
+def _told(objective: Objective, situation: Situation, missed: Array) -> list[str]:
+    """Say which constraints are missed and by how much, the worst first."""
+    constraints = situation.build.expectation.constraints
+    worst = [k for k in np.argsort(-missed) if missed[k] > 0.0]
+    return [f"{constraints[k].told(objective.tree)} by {missed[k]:.3g}" for k in worst]
 
 
 def _explored(
@@ -105,7 +126,7 @@ def _explored(
     """Return a random plan, or None where it would meet what lacks samples too seldom."""
     search = explore(problem, selections, lacking, seed)
     drawn = search.runs[0]
-    nodes = objective.outcomes_of(situation, drawn.point, _selections(objective, drawn))
+    nodes = objective.outcomes_of(situation, drawn.point, _names(objective, drawn.choices))
     return search if met(nodes, lacking) else None
 
 
@@ -134,15 +155,24 @@ def _problem(
         else:
             check_choice(label, value, slot)
             allowed[label] = (slot.choices.index(value),)
+    constraints = situation.build.expectation.constraints
     return Problem(
-        kernel=situation.build.kernel.bind(situation.shared, low, high),
+        kernel=situation.bind(low, high),
         situation=situation,
         low=low,
         high=high,
         sizes=tuple(slot.size for slot in selections.values()),
         allowed=tuple(allowed.values()),
+        cut=lambda choices: objective.chosen(_names(objective, choices)).situation(situation.given),
         guesses=tuple(_guess(objective, one, allowed) for one in _listed(guess)),
         progress=progress,
+        constrained=Constrained(
+            constraints,
+            lambda actions, hot: situation.build.margins([actions, hot, *situation.shared])[0],
+            lambda multipliers, weights: situation.bind(low, high, multipliers, weights),
+        )
+        if constraints
+        else None,
     )
 
 
@@ -199,9 +229,10 @@ def _planned_slot(objective: Objective, label: str, place: str) -> Action | Sele
     raise InputError(f"{place}: {label!r} is no action or selection{hint} Actions and selections: {names(planned)}")
 
 
-def _selections(objective: Objective, run: Run) -> dict[str, str]:
+def _names(objective: Objective, choices: Choices) -> dict[str, str]:
+    """Return {label: choice} of choices (s,)."""
     slots = objective.graph.selections().items()
-    return {label: slot.choices[int(c)] for (label, slot), c in zip(slots, run.choices, strict=True)}
+    return {label: slot.choices[int(c)] for (label, slot), c in zip(slots, choices, strict=True)}
 
 
 def _why_not_finite(objective: Objective, situation: Situation, search: Search) -> str:
@@ -210,7 +241,7 @@ def _why_not_finite(objective: Objective, situation: Situation, search: Search) 
     if not search.runs or died == len(search.runs):
         return f"no start point was finished: {search.status}; {died} runs were lost with their worker processes"
     run = search.runs[0]
-    selections = _selections(objective, run)
+    selections = _names(objective, run.choices)
     at = f"at actions {objective.unstack(run.start)}, selections {selections}"
     for node in objective.outcomes_of(situation, run.start, selections):
         if not node.probability:
@@ -242,7 +273,7 @@ class _Runs(Sequence[PlanRun]):
             return [self[i] for i in range(*index.indices(len(self)))]
         run = self._runs[index]
         return PlanRun(
-            selections=_selections(self._objective, run),
+            selections=_names(self._objective, run.choices),
             start=self._objective.unstack(run.start),
             actions=self._objective.unstack(run.point),
             value=run.value,

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from symgraph.errors import SlotError, names
 
 Array = npt.NDArray[np.float64]
+Choices = npt.NDArray[np.int64]  # (P, number of selections): which choice of each selection, a row per point
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,8 @@ class Structure:
         numbers: dict[tuple[Any, ...], int] = {}
         reads: dict[int, frozenset[str]] = {}  # by kind
         for node in reversed(tree.nodes):
-            key: list[Any] = [node.cut]
-            found = set[str]()
+            key: list[Any] = [node.cut, *(id(requirement) for requirement in node.requirements)]
+            found = set[str]().union(*(self._states(requirement.model) for requirement in node.requirements))
             for group in node.groups:
                 probability = group.group.probability
                 found |= self._states(probability if isinstance(probability, BoundModel) else None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,6 +13,7 @@ from symgraph.binding import BoundModel
 from symgraph.drawing import Diagram, DiagramEdge, DiagramNode, NodeKind
 from symgraph.errors import GraphError, did_you_mean, names
 from symgraph.graph import Branch, Graph, Group, edge_label
+from symgraph.requirement import Requirement
 from symgraph.slots import State
 
 MOST_SHOWN = 300  # nodes that a notebook draws unasked; more take long and nobody can read them
@@ -46,6 +47,7 @@ class TreeNode:
     step: str  # what leads here from the parent: "landed" or "landed[lower]"
     cut: bool  # visited too often on this path: ends here with the cut value
     groups: tuple[TreeGroup, ...] = ()
+    requirements: tuple[Requirement, ...] = ()
 
 
 class Tree:
@@ -80,6 +82,8 @@ class Tree:
         written = {0: frozenset[str]()}
         for node in self.nodes:
             here = written.pop(node.index)
+            for requirement in node.requirements:
+                read(requirement.model, here)
             for tree_group in node.groups:
                 if isinstance(tree_group.group.probability, BoundModel):
                     read(tree_group.group.probability, here)
@@ -95,11 +99,40 @@ class Tree:
         """Every model of the tree once, in the order of the nodes."""
         found: dict[BoundModel, None] = {}
         for node in self.nodes:
+            found.update({requirement.model: None for requirement in node.requirements})
             for tree_group in node.groups:
                 if isinstance(tree_group.group.probability, BoundModel):
                     found[tree_group.group.probability] = None
                 found.update({b.branch.model: None for b in tree_group.branches if b.branch.model is not None})
         return tuple(found)
+
+    def chosen(self, selections: Mapping[str, str]) -> Tree:
+        """Return the tree without the branches that selections rule out; its paths are those of this one.
+
+        Args:
+            selections: {label: choice} of all selections.
+        """
+        kept = [0]  # grows while it is walked; the new index of a node is its place
+        nodes: list[TreeNode] = []
+        parents: list[int | None] = [None]
+        for old in kept:
+            node = self.nodes[old]
+            groups = []
+            for group in node.groups:
+                choice = None if group.group.selection is None else selections[group.group.selection]
+                branches = []
+                for branch in group.branches:
+                    if choice is not None and branch.branch.label != choice:
+                        continue
+                    child = branch.child
+                    if child is not None:
+                        kept.append(child)
+                        parents.append(len(nodes))
+                        child = len(kept) - 1
+                    branches.append(TreeBranch(branch.branch, branch.share if choice is None else 1.0, child))
+                groups.append(TreeGroup(group.group, tuple(branches)))
+            nodes.append(replace(node, index=len(nodes), parent=parents[len(nodes)], groups=tuple(groups)))
+        return Tree(self.graph, tuple(nodes), self.max_visits, self.cut_value)
 
     def diagram(
         self,
@@ -174,7 +207,7 @@ def unroll(graph: Graph, max_visits: int = 3, start: str | None = None, cut_valu
     for name in dict.fromkeys((graph.start, graph.start if start is None else start)):
         if name not in known:
             raise GraphError(
-                f"start node {name!r} is in no edge, choose, chance or reward{did_you_mean(name, known)}"
+                f"start node {name!r} is in no edge, choose, chance, reward or requirement{did_you_mean(name, known)}"
                 f" Nodes: {names(known)}"
             )
     graph.check_reachable()
@@ -183,7 +216,7 @@ def unroll(graph: Graph, max_visits: int = 3, start: str | None = None, cut_valu
 
 def _mentioned(graph: Graph, node: str) -> bool:
     targets = {branch.target for groups in graph.groups.values() for group in groups for branch in group.branches}
-    return node in graph.groups or node in targets
+    return node in graph.groups or node in targets or node in graph.requirements
 
 
 @dataclass(frozen=True)
@@ -214,10 +247,10 @@ class _Unroller:
             cut = times > self._max_visits
             visits.append({**before, arrival.name: times} if not cut else before)
             index = len(nodes)
-            groups = (
-                () if cut else tuple(self._group(g, index, arrival) for g in self._graph.groups.get(arrival.name, ()))
-            )
-            nodes.append(TreeNode(index, arrival.name, arrival.parent, arrival.step, cut, groups))
+            here = () if cut else self._graph.groups.get(arrival.name, ())
+            groups = tuple(self._group(group, index, arrival) for group in here)
+            requirements = () if cut else tuple(self._graph.requirements.get(arrival.name, ()))
+            nodes.append(TreeNode(index, arrival.name, arrival.parent, arrival.step, cut, groups, requirements))
             if len(self._arrivals) > MAX_NODES:
                 raise GraphError(
                     f"the tree has more than {MAX_NODES:,} nodes at max_visits = {self._max_visits}; lower max_visits "

@@ -226,7 +226,9 @@ class Draws:
 
 def problem_of(kernel, n=1, low=0.0, high=1.0, allowed=(), guesses=()):
     sizes = tuple(len(choices) for choices in allowed)
-    return Problem(kernel, SimpleNamespace(), np.full(n, low), np.full(n, high), sizes, tuple(allowed), tuple(guesses))
+    return Problem(
+        kernel, SimpleNamespace(), np.full(n, low), np.full(n, high), sizes, tuple(allowed), None, tuple(guesses)
+    )
 
 
 def search(kernel, draws=(), guesses=(), n=1, **settings):

@@ -19,7 +19,7 @@ selections = st.lists(
 
 def problem_of(sizes=(), allowed=(), low=(0.0,), high=(1.0,), kernel=None, guesses=()):
     box = np.array(low), np.array(high)
-    return Problem(kernel, SimpleNamespace(), *box, tuple(sizes), tuple(allowed), tuple(guesses))
+    return Problem(kernel, SimpleNamespace(), *box, tuple(sizes), tuple(allowed), None, tuple(guesses))
 
 
 @given(selections, st.integers(0, 60), st.booleans(), st.integers(0, 99))

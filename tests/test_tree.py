@@ -47,7 +47,7 @@ REFUSED = {
     "cut words": (lambda: sg.unroll(loop(), cut_value="low"), ["cut_value = 'low'"]),
     "start": (
         lambda: sg.unroll(graph("nn")),
-        ["start node 'nn' is in no edge, choose, chance or reward", "Nodes: (none)"],
+        ["start node 'nn' is in no edge, choose, chance, reward or requirement", "Nodes: (none)"],
     ),
     "misspelt": (
         lambda: sg.unroll(loop(), start="nn"),

@@ -11,10 +11,10 @@ import numpy as np
 
 from symgraph.compile.kernel import AdadeltaSteps, BoundKernel, Ended
 from symgraph.errors import InputError
-from symgraph.optimizers.problem import Choices, Optimizer, Problem, Run, Search, best_of
+from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
 from symgraph.optimizers.settings import number, positive_whole
 from symgraph.optimizers.starts import climbed, promising_points, status_of
-from symgraph.slots import Array
+from symgraph.slots import Array, Choices
 
 RUNS_PER_TASK = 4  # runs that a worker process is handed at once
 MAX_DEATHS = 2  # workers that may die before the search ends with what it has
@@ -22,6 +22,7 @@ SMALLEST_EPSILON = 1e-300  # 0 would keep every point where it is
 SAMPLES_PER_COMBINATION = 8
 POLISHED = 2  # best runs of each combination of selections that are polished
 POLISH_ITERATIONS = 200
+CONSTRAINED_ITERATIONS = 2000  # where one climb follows the other until requirements are met
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,9 @@ class Adadelta(Optimizer):
             interrupted = True
         if self.polish and not interrupted:
             polished, interrupted = self._polished(problem, ended)
-            ended += polished
+            ended = [*map(problem.judge, ended), *polished]
+        else:
+            ended = [*map(problem.judge, ended)]
         status = status_of(problem, ended, len({run.start.tobytes() + run.choices.tobytes() for run in ended}))
         if deaths > MAX_DEATHS:
             status = f"best of {len(ended)} runs: given up, because worker processes died again and again"
@@ -168,7 +171,8 @@ class Adadelta(Optimizer):
             return [], False
         points = np.array([run.point for run in chosen])
         choices = np.array([run.choices for run in chosen])
-        polished = climbed(problem, points, choices, POLISH_ITERATIONS, 1e-9)
+        iterations = POLISH_ITERATIONS if problem.constrained is None else CONSTRAINED_ITERATIONS
+        polished = climbed(problem, points, choices, iterations, 1e-9)
         for before, after in zip(chosen, polished, strict=False):
             after.start = before.start
         return polished, len(polished) < len(chosen)
@@ -190,7 +194,7 @@ class _Queue:
             guessed, guessed_choices = problem.started_from_guesses(rng)
             points, choices = np.concatenate([guessed, points]), np.concatenate([guessed_choices, choices])
         self.starts = len(points)
-        values = problem.values(points, choices)
+        values = problem.merits(points, choices, problem.values(points, choices))
         self._in_turn = not settings.requeue
         self.waiting = [
             Run(point, point, choice, float(value), "iteration limit", np.zeros(0))
@@ -220,9 +224,9 @@ class _Queue:
         return Run(point, point, best.choices, -np.inf, "iteration limit", np.zeros(0))
 
 
-def _move(kernel: BoundKernel, points: Array, hot: Array, limit: int, steps: list[AdadeltaSteps]) -> list[Ended]:
+def _move(kernels: list[BoundKernel], points: Array, hot: Array, limit: int, steps: list[AdadeltaSteps]) -> list[Ended]:
     """Move points (P, n) one after the other; at the top level so that worker processes find it."""
-    return [kernel.ascend(p, h, limit, s) for p, h, s in zip(points, hot, steps, strict=True)]
+    return [k.ascend(p, h, limit, s) for k, p, h, s in zip(kernels, points, hot, steps, strict=True)]
 
 
 @contextmanager
@@ -250,7 +254,7 @@ def _movers(processes: int) -> Iterator[Callable[[Adadelta, Problem, list[Run], 
 def _task(settings: Adadelta, problem: Problem, batch: list[Run], limit: int) -> tuple[Any, ...]:
     points, choices = np.array([run.point for run in batch]), np.array([run.choices for run in batch])
     steps = [settings._steps(problem, run.choices) for run in batch]
-    return problem.kernel, points, problem.one_hot(choices), limit, steps
+    return [problem.kernel_for(run.choices) for run in batch], points, problem.one_hot(choices), limit, steps
 
 
 def _joined(batch: list[Run], ended: list[Ended]) -> list[Run]:

@@ -15,10 +15,10 @@ import numpy as np
 
 from symgraph.compile.kernel import Outcome
 from symgraph.objective import Build
-from symgraph.optimizers.problem import Choices, Optimizer, Problem, Run, Search
+from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
 from symgraph.optimizers.settings import number, positive_whole
 from symgraph.optimizers.starts import promising_points
-from symgraph.slots import Array
+from symgraph.slots import Array, Choices
 
 SMALLEST_TOLERANCE = 1e-15  # IPOPT refuses 0
 _OUTCOMES: dict[str, Outcome] = {
@@ -60,7 +60,7 @@ class Ipopt(Optimizer):
             # One candidate for each combination of selections.
             groups = min(self.samples, problem.combinations)
             points, choices = promising_points(problem, rng, groups, max(1, self.samples // groups))
-            best = int(np.argmax(problem.values(points, choices)))
+            best = int(np.argmax(problem.merits(points, choices, problem.values(points, choices))))
             points, choices = points[best : best + 1], choices[best : best + 1]
         runs: list[Run] = []
         problem.progress.wait("planning")
@@ -82,30 +82,44 @@ class Ipopt(Optimizer):
             return Run(point, point, choice, start_value, "not finite", np.array([start_value]))
         if problem.n == 0:
             return Run(point, point, choice, start_value, "converged", np.array([start_value]))
-        solver = self._solver(problem.situation.build, interrupted)
+        situation = problem.cut(choice)
+        solver = self._solver(situation.build, interrupted)
         scale = problem.scale(choice)
-        parameters = np.concatenate([hot[0], *problem.situation.shared, [scale]])
-        found = solver(x0=point, lbx=problem.low, ubx=problem.high, p=parameters)
+        least = [0.0 if one.is_equality else -np.inf for one in situation.build.expectation.constraints]
+        found = solver(
+            x0=point,
+            lbx=problem.low,
+            ubx=problem.high,
+            lbg=least,
+            ubg=0.0,
+            p=np.concatenate([hot[0], *situation.shared, [scale]]),
+        )
         statistics = solver.stats()
-        status = str(statistics["return_status"])
+        outcome = _OUTCOMES.get(str(statistics["return_status"]), "stalled")
+        history = -scale * np.array(statistics.get("iterations", {}).get("obj", [-start_value / scale]))
         end = np.clip(np.array(found["x"]).ravel(), problem.low, problem.high)
-        value = float(problem.values(end[None], choice[None])[0])
-        if not value >= start_value:  # not finite half-way, or gone astray: the start is the better plan
-            end, value = point, start_value
-        objectives = statistics.get("iterations", {}).get("obj", [-start_value / scale])
-        history = -scale * np.array(objectives)
-        return Run(point, end, choice, value, _OUTCOMES.get(status, "stalled"), history)
+        runs = [
+            problem.judge(Run(point, at, choice, float(problem.values(at[None], choice[None])[0]), outcome, history))
+            for at in (end, point)
+        ]
+        # Not finite half-way, or gone astray: then the start is the better plan.
+        return best_of(runs) or runs[1]
 
     def _solver(self, build: Build, interrupted: list[int]) -> ca.Function:
-        """Return IPOPT on −J/scale over the actions; its parameters are the other inputs and the scale, stacked."""
+        """Return IPOPT on −J/scale over the actions, held to the constraints, for the other inputs and the scale."""
         key = Ipopt, self.iterations, self.tolerance
         if key not in build.kept:
             expectation = build.expectation
             actions, *others = expectation.inputs.symbols
             scale = ca.MX.sym("scale")
             others_and_scale = ca.veccat(*others, scale)
-            watch = _Watch(actions.numel(), others_and_scale.numel())
-            problem: Any = {"x": actions, "p": others_and_scale, "f": -expectation.value / scale}
+            watch = _Watch(actions.numel(), others_and_scale.numel(), len(expectation.constraints))
+            problem: Any = {
+                "x": actions,
+                "p": others_and_scale,
+                "f": -expectation.value / scale,
+                "g": expectation.margins,
+            }
             options: Any = {
                 "print_time": False,
                 "error_on_fail": False,
@@ -123,10 +137,11 @@ class Ipopt(Optimizer):
 class _Watch(ca.Callback):
     """Is called after each iteration of IPOPT and ends it after Ctrl-C."""
 
-    def __init__(self, n_actions: int, n_parameters: int) -> None:
+    def __init__(self, n_actions: int, n_parameters: int, n_constraints: int) -> None:
         ca.Callback.__init__(self)
         self.interrupted: list[int] = []
         self._sizes = {"x": n_actions, "lam_x": n_actions, "f": 1, "lam_p": n_parameters}
+        self._sizes |= {"g": n_constraints, "lam_g": n_constraints}
         self.construct("watch", {})
 
     def get_n_in(self) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,14 +12,13 @@ import numpy.typing as npt
 
 from symgraph.compile.kernel import BoundKernel, Ended, Outcome
 from symgraph.objective import Situation
+from symgraph.optimizers.constrained import MET, Constrained
 from symgraph.progress import Progress
-from symgraph.slots import Array
+from symgraph.slots import Array, Choices
 
 SCALE_SAMPLES = 32
 FEWEST_SAMPLES = 16
 GUESS_COMBINATIONS = 1024  # of selections that a guess leaves out
-
-Choices = npt.NDArray[np.int64]  # (P, number of selections): which choice of each selection, a row per point
 
 
 @dataclass(frozen=True)
@@ -32,8 +31,10 @@ class Problem:
         low, high: (n,) bounds of the stacked actions; a held action has low = high.
         sizes: number of choices of each selection.
         allowed: for each selection, the choices that are not ruled out.
+        cut: choices (s,) → the situation with the tree that they leave.
         guesses: start points from the user, each (n,) actions (NaN: not given) and (s,) choices (-1: not given).
         progress: to report to.
+        constrained: the requirements, None if there are none.
     """
 
     kernel: BoundKernel
@@ -42,8 +43,10 @@ class Problem:
     high: Array
     sizes: tuple[int, ...]
     allowed: tuple[tuple[int, ...], ...]
+    cut: Callable[[Choices], Situation]
     guesses: tuple[tuple[Array, Choices], ...] = ()
     progress: Progress = field(default_factory=lambda: Progress("planning", shown=False))
+    constrained: Constrained | None = None
     _scales: dict[bytes, float] = field(default_factory=dict)
 
     @property
@@ -59,6 +62,43 @@ class Problem:
         """Return the values (P,) of points (P, n) under choices (P, s), -inf where they are not finite."""
         values, _ = self.kernel.evaluate(points, self.one_hot(choices))
         return np.where(np.isfinite(values), values, -np.inf)
+
+    def merits(self, points: Array, choices: Choices, values: Array) -> Array:
+        """Return values (P,) at points (P, n) under choices (P, s) less penalties for requirements that are missed."""
+        if self.constrained is None:
+            return values
+        margins = self.constrained.margins(points, self.one_hot(choices))
+        penalties = np.zeros(len(points))
+        groups, which = np.unique(choices, axis=0, return_inverse=True)
+        for g, group in enumerate(groups):
+            rows = which.ravel() == g
+            self.know(group)
+            penalties[rows] = self.constrained.penalty(margins[rows], group, self.scale(group))
+        return np.where(np.isfinite(penalties), values - penalties, -np.inf)
+
+    def kernel_for(self, choice: Choices) -> BoundKernel:
+        """Return the kernel that a search without constraints climbs under choices (s,): J, less penalties."""
+        if self.constrained is None:
+            return self.kernel
+        self.know(choice)
+        return self.constrained.penalised(choice, self.scale(choice))
+
+    def judge(self, run: Run) -> Run:
+        """Give a run of penalised values the value of J, and what it misses."""
+        if self.constrained is None or not np.isfinite(run.value):
+            return run
+        self.know(run.choices)
+        run.value = float(self.values(run.point[None], run.choices[None])[0])
+        margins = self.constrained.margins(run.point[None], self.one_hot(run.choices[None]))
+        run.missed = float(self.constrained.missed(margins, run.choices)[0])
+        return run
+
+    def know(self, choice: Choices) -> None:
+        """Find out how much the margins of requirements vary under choices (s,)."""
+        if self.constrained is not None and not self.constrained.knows(choice):
+            points = self.draw_points(np.random.default_rng(0), SCALE_SAMPLES, "spread")
+            hot = np.tile(self.one_hot(choice[None]), (SCALE_SAMPLES, 1))
+            self.constrained.learn_spread(choice, self.constrained.margins(points, hot))
 
     def one_hot(self, choices: Choices) -> Array:
         """Return (P, Σ sizes) one-hot rows."""
@@ -147,8 +187,10 @@ class Problem:
             points[i] = np.where(np.isnan(point), points[i], np.clip(point, self.low, self.high))
             tried = self.draw_choices(rng, min(self.combinations, GUESS_COMBINATIONS), evenly=True)
             tried = np.unique(np.where(choice < 0, tried, choice), axis=0)
-            values = self.values(np.tile(points[i], (len(tried), 1)), tried) if len(tried) > 1 else np.zeros(1)
-            choices[i] = tried[int(np.argmax(values))]
+            if len(tried) > 1:
+                there = np.tile(points[i], (len(tried), 1))
+                tried = tried[[int(np.argmax(self.merits(there, tried, self.values(there, tried))))]]
+            choices[i] = tried[0]
         return points, choices
 
 
@@ -163,6 +205,7 @@ class Run:
         value: the expected reward at `point`, -inf where nothing finite was met.
         outcome: why it ended.
         history: the values on the way, one per gradient.
+        missed: by how much requirements are missed, as a share of how much their margins vary.
     """
 
     start: Array
@@ -171,6 +214,7 @@ class Run:
     value: float
     outcome: Outcome
     history: Array
+    missed: float = 0.0
 
     @classmethod
     def of(cls, start: Array, choices: Choices, ended: Ended) -> Run:
@@ -195,6 +239,12 @@ class Optimizer(ABC):
 
 
 def best_of(runs: Sequence[Run]) -> Run | None:
-    """Return the run with the highest finite value, the first of equals."""
-    finite = [run for run in runs if np.isfinite(run.value)]
-    return max(finite, key=lambda run: run.value) if finite else None
+    """Return the run with the highest finite value of those that meet all requirements, the first of equals.
+
+    If none does, the one that misses least.
+    """
+    finite = [run for run in runs if np.isfinite(run.value) and np.isfinite(run.missed)]
+    if not finite:
+        return None
+    meeting = [run for run in finite if run.missed <= MET]
+    return max(meeting, key=lambda run: run.value) if meeting else min(finite, key=lambda run: run.missed)

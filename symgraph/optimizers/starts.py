@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from symgraph.optimizers.problem import Choices, Problem, Run
-from symgraph.slots import Array
+from symgraph.optimizers.problem import Problem, Run
+from symgraph.slots import Array, Choices
 
 MOST_SAMPLES = 1024  # of one combination of selections: all are compared with each other
 
@@ -25,12 +25,20 @@ def climbed(problem: Problem, points: Array, choices: Choices, iterations: int, 
     runs: list[Run] = []
     try:
         for p in range(len(points)):
-            ended = problem.kernel.climb(points[p], hot[p], iterations, tolerance * problem.scale(choices[p]))
-            runs.append(Run.of(points[p], choices[p], ended))
+            runs.append(_climbed(problem, points[p], choices[p], hot[p], iterations, tolerance))
             problem.progress.update(p + 1, len(points))
     except KeyboardInterrupt:
         pass
     return runs
+
+
+def _climbed(problem: Problem, start: Array, choice: Choices, hot: Array, iterations: int, tolerance: float) -> Run:
+    scale = problem.scale(choice)
+    if problem.constrained is None:
+        return Run.of(start, choice, problem.kernel.climb(start, hot, iterations, tolerance * scale))
+    problem.know(choice)
+    ended, _ = problem.constrained.climb(start, choice, hot, iterations, tolerance, scale)
+    return problem.judge(Run.of(start, choice, ended))
 
 
 def promising_points(problem: Problem, rng: np.random.Generator, starts: int, samples: int) -> tuple[Array, Choices]:
@@ -45,6 +53,8 @@ def promising_points(problem: Problem, rng: np.random.Generator, starts: int, sa
     by_group = values.reshape(looked_at, count)
     for group, sampled in zip(groups, by_group, strict=True):
         problem.remember_scale(group, sampled)
+    values = problem.merits(points, choices, values)
+    by_group = values.reshape(looked_at, count)
     peaks = _peaks(problem.unit(points).reshape(looked_at, count, problem.n), by_group, each)
     kept = (peaks + count * np.arange(looked_at)[:, None]).ravel()
     if looked_at > starts:  # not every combination has a start: those with the best samples have
