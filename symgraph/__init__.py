@@ -14,7 +14,7 @@ from symgraph.errors import (
 from symgraph.graph import Graph
 from symgraph.model import Model, Parameter, Propagator
 from symgraph.objective import Objective
-from symgraph.optimizers import Adadelta, Ipopt, Lbfgs
+from symgraph.optimizers import Adadelta, Bonmin, Enumerate, Ipopt, Lbfgs
 from symgraph.plan import Plan
 from symgraph.planner import solve
 from symgraph.plots import plot_runs, plot_value
@@ -24,7 +24,9 @@ from symgraph.tree import Tree, unroll
 __all__ = [
     "Action",
     "Adadelta",
+    "Bonmin",
     "CompileError",
+    "Enumerate",
     "Gaussian",
     "Graph",
     "GraphError",

@@ -130,24 +130,27 @@ class Expectation:
         return ca.Function("hessian", self.inputs.symbols, [ca.densify(ca.hessian(self.value, self.inputs.actions)[0])])
 
 
-def expected_value(tree: Tree, uncertain: frozenset[str]) -> Expectation:
+def expected_value(tree: Tree, uncertain: frozenset[str], relaxed: bool = False) -> Expectation:
     """Write down the expected sum of rewards of a tree.
 
     Args:
         tree: the unrolled graph.
         uncertain: the start states that come with a covariance; for the others no covariance enters the expression.
+        relaxed: selections may be anything between their choices: a branch's value and margins are weighed with its
+            element of the one-hot column, as if it were a probability, so that derivatives by selections exist.
 
     Source: Yamaguchi & Atkeson, Humanoids 2016, equations (1)–(4).
     """
-    return _Writer(tree, Inputs(tree, uncertain)).run()
+    return _Writer(tree, Inputs(tree, uncertain), relaxed).run()
 
 
 class _Writer:
     """Writes the expression: dictionaries from the root to the leaves, values from the leaves to the root."""
 
-    def __init__(self, tree: Tree, inputs: Inputs) -> None:
+    def __init__(self, tree: Tree, inputs: Inputs, relaxed: bool) -> None:
         self._tree = tree
         self._inputs = inputs
+        self._relaxed = relaxed
         self._structure = Structure(tree)
         self._functions: dict[tuple[Any, ...], ca.Function] = {}
 
@@ -197,7 +200,8 @@ class _Writer:
         name = f"branch_{len(self._functions)}"
         inputs = symbols + self._shared_symbols
         # Nobody asks for derivatives by selections and weights, and the reverse sweep would compute them.
-        follows = [True] * (len(symbols) + 1) + [False] * (len(self._shared_symbols) - 1)
+        by = 2 if self._relaxed else 1
+        follows = [True] * (len(symbols) + by) + [False] * (len(self._shared_symbols) - by)
         function = ca.Function(name, inputs, results, {"cse": True, "is_diff_in": follows})
         if own + instructions <= FLATTEN_LIMIT:
             function = function.expand()
@@ -239,7 +243,7 @@ class _Writer:
             for group in self._tree.nodes[index].groups:
                 if is_open(group):
                     instructions = math.inf
-                    terms[index].append((1.0, self._switch(group, here)))
+                    terms[index].append((1.0, (self._blend if self._relaxed else self._switch)(group, here)))
                     continue
                 model = group.group.probability
                 shares, count = _apply(model if isinstance(model, BoundModel) else None, here)
@@ -271,6 +275,17 @@ class _Writer:
                 margins[index] += below
             values[index] = total
         return values[root], margins[root], instructions
+
+    def _blend(self, group: TreeGroup, here: Dictionary) -> list[ca.MX]:
+        """Write a choice whose selection may be anything between its choices."""
+        shares = ca.vertsplit(self._inputs.root[str(group.group.selection)].mean)
+        total, all_margins = ca.MX(0.0), []
+        for share, branch in zip(shares, group.branches, strict=True):
+            function, arguments = self._call(branch, here)
+            value, *margins = function.call(arguments)
+            total += share * value
+            all_margins += [share * margin for margin in margins]
+        return [total, *all_margins]
 
     def _switch(self, group: TreeGroup, here: Dictionary) -> list[ca.MX]:
         """Write a choice: the function of the selected branch, the others not evaluated."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from symgraph.compile import make_kernel
 from symgraph.compile.interpreted import FlatFunction
-from symgraph.compile.kernel import BoundKernel, Kernel
+from symgraph.compile.kernel import NEVER, BoundKernel, Kernel, Stop
 from symgraph.constraints import violations
 from symgraph.errors import InputError, SlotError, did_you_mean, names
 from symgraph.expectation import Expectation, expected_value
@@ -33,6 +33,11 @@ class Build:
     @cached_property
     def expectation(self) -> Expectation:
         return expected_value(self._tree, self._uncertain)
+
+    @cached_property
+    def relaxed(self) -> Expectation:
+        """With selections that may be anything between their choices."""
+        return expected_value(self._tree, self._uncertain, relaxed=True)
 
     @cached_property
     def function(self) -> ca.Function:
@@ -81,7 +86,12 @@ class Situation:
         return [self.means, self.covariances, *(p.value.ravel(order="F") for p in parameters)]
 
     def bind(
-        self, low: Array, high: Array, multipliers: Array | None = None, weights: Array | None = None
+        self,
+        low: Array,
+        high: Array,
+        multipliers: Array | None = None,
+        weights: Array | None = None,
+        stop: Stop = NEVER,
     ) -> BoundKernel:
         """Return the kernel at this state.
 
@@ -90,10 +100,11 @@ class Situation:
             high: likewise.
             multipliers: (k,) of the constraints, 0 if left out: with weights of 0 they have no part in the value.
             weights: (k,) likewise.
+            stop: ends searches early.
         """
         nothing = np.zeros(len(self.build.expectation.constraints))
         pulls = [nothing if given is None else given for given in (multipliers, weights)] if nothing.size else []
-        return self.build.kernel.bind([*self.shared, *pulls], low, high)
+        return self.build.kernel.bind([*self.shared, *pulls], low, high, stop)
 
 
 class Objective:

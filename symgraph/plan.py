@@ -28,7 +28,7 @@ class PlanRun:
         actions: {label: value} at the end [unit].
         value: expected reward at the end; -inf where nothing finite was met.
         outcome: "converged", "iteration limit", "oscillation", "stalled" (no step gains any more), "not finite",
-            "worker died", or "drawn" (at random, by a plan that explores).
+            "time limit", "worker died", or "drawn" (at random, by a plan that explores).
         gradients: gradient evaluations.
         history: the values on the way.
     """
@@ -51,7 +51,8 @@ class Plan:
         selections: {label: choice}.
         value: the expected sum of rewards.
         violation: the largest breach of a requirement, in the unit of its model; 0 if all are met.
-        status: what is known: "converged", "best of N starts", "exploring: model 'm' has 2 of 3 samples", …
+        status: what is known: "converged", "best of N starts", "time limit: …", "requirements are missed: …",
+            "exploring: model 'm' has 2 of 3 samples", …
         notes: what makes the value less than it seems, e.g. paths that are cut.
         nodes: the outcome at every tree node, in tree order.
         runs: a row per start point.

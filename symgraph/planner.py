@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, overload
 
 import numpy as np
 
 from symgraph.binding import BoundModel
+from symgraph.compile.kernel import Stop
 from symgraph.errors import InputError, SolveError, did_you_mean, names
 from symgraph.exploration import Decisions, explore, lacking_models, met
 from symgraph.objective import Objective, Situation, check_choice, checked_column, stacked_index
 from symgraph.optimizers.constrained import MET, Constrained
 from symgraph.optimizers.lbfgs import Lbfgs
 from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
+from symgraph.optimizers.settings import number
+from symgraph.optimizers.starts import status_of
 from symgraph.plan import Plan, PlanRun
 from symgraph.progress import Progress
 from symgraph.slots import Action, Array, Choices, Selection, State
@@ -32,6 +37,7 @@ def solve(
     guess: Guess | Sequence[Guess] | None = None,
     fixed: Mapping[str, Any] | None = None,
     seed: int = 0,
+    time_limit: float | None = None,
     progress: bool = True,
 ) -> Plan:
     """Find the actions and selections with the highest expected sum of rewards that meet all requirements.
@@ -47,7 +53,8 @@ def solve(
         optimizer: `Lbfgs()` if left out: it finds the best plan soonest; `Adadelta()`, `Ipopt()`, … otherwise.
         guess: start points to add: a plan, {label: value} of some actions and selections, or a list of them.
         fixed: {label: value} of actions and selections that are held.
-        seed: of all that is random; the same seed gives the same plan.
+        seed: of all that is random; the same seed gives the same plan, unless time runs out.
+        time_limit: after which the best so far is returned [s]; building and compiling at first use come on top.
         progress: show a progress bar where it takes longer than two seconds.
 
     Raises:
@@ -61,12 +68,15 @@ def solve(
         raise InputError(f"optimizer is {optimizer!r}; give one, e.g. Lbfgs(), with its parentheses")
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise InputError(f"seed = {seed!r}; give a whole number of at least 0")
+    if time_limit is not None:
+        number("time_limit", time_limit, "solve", 0.0)
     begin = time.perf_counter()
     situation = objective.situation(state)
+    stop = Stop(time_limit)
     with Progress("planning", progress) as bar:
         if not situation.build.has_kernel:
             bar.wait("compiling")
-        problem = _problem(objective, situation, guess, fixed or {}, bar)
+        problem = _problem(objective, situation, guess, fixed or {}, bar, stop)
         bar.begin("planning")
         rng = np.random.default_rng(seed)
         selections = list(objective.graph.selections())
@@ -74,7 +84,8 @@ def solve(
         search = _explored(objective, situation, problem, selections, lacking, int(seed)) if lacking else None
         explores = search is not None
         if search is None:
-            search = optimizer.run(problem, rng)
+            with _set_in_time(stop):
+                search = optimizer.run(problem, rng)
     best = search.runs[0] if explores else best_of(search.runs)
     if best is None:
         if search.interrupted:
@@ -83,7 +94,11 @@ def solve(
     chosen = _names(objective, best.choices)
     nodes = objective.outcomes_of(situation, best.point, chosen)
     missed = objective.missed(situation, best.point, objective.one_hot(chosen))
-    status = f"interrupted: best of {len(search.runs)} runs" if search.interrupted else search.status
+    status = search.status
+    if search.interrupted:
+        status = f"interrupted: best of {len(search.runs)} runs"
+    elif stop:
+        status = f"time limit: {status_of(problem, search.runs, len(search.runs))}"
     if best.missed > MET:
         status = f"requirements are missed: {_told(objective, situation, missed)[0]}; {status}"
     planned_or_seen: dict[str, Action | State] = {**objective.graph.actions(), **objective.graph.states()}
@@ -106,6 +121,18 @@ def solve(
         seconds=time.perf_counter() - begin,
         units={label: slot.unit for label, slot in planned_or_seen.items() if slot.unit},
     )
+
+
+@contextmanager
+def _set_in_time(stop: Stop) -> Iterator[None]:
+    """Set a stop after its seconds while something goes on."""
+    timer = threading.Timer(float(stop.seconds or 0.0), stop.set)
+    if stop.seconds is not None:
+        timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def _told(objective: Objective, situation: Situation, missed: Array) -> list[str]:
@@ -141,6 +168,7 @@ def _problem(
     guess: Guess | Sequence[Guess] | None,
     fixed: Mapping[str, Any],
     progress: Progress,
+    stop: Stop,
 ) -> Problem:
     low, high = (bound.copy() for bound in objective.bounds)
     selections = objective.graph.selections()
@@ -157,7 +185,7 @@ def _problem(
             allowed[label] = (slot.choices.index(value),)
     constraints = situation.build.expectation.constraints
     return Problem(
-        kernel=situation.bind(low, high),
+        kernel=situation.bind(low, high, stop=stop),
         situation=situation,
         low=low,
         high=high,
@@ -169,10 +197,11 @@ def _problem(
         constrained=Constrained(
             constraints,
             lambda actions, hot: situation.build.margins([actions, hot, *situation.shared])[0],
-            lambda multipliers, weights: situation.bind(low, high, multipliers, weights),
+            lambda multipliers, weights: situation.bind(low, high, multipliers, weights, stop),
         )
         if constraints
         else None,
+        stop=stop,
     )
 
 

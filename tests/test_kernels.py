@@ -17,7 +17,7 @@ import symgraph as sg
 from symgraph.compile import toolchain
 from symgraph.compile.compiled import CompiledKernel
 from symgraph.compile.interpreted import InterpretedKernel
-from symgraph.compile.kernel import AdadeltaSteps
+from symgraph.compile.kernel import AdadeltaSteps, Stop
 
 ROOT = Path(__file__).parents[1]
 
@@ -355,3 +355,24 @@ def test_a_broken_compiler_gives_a_warning_and_the_interpreter(cache, tmp_path, 
     if how == "refuses":
         assert "no room" in str(warning.message)
     assert not list(cache.glob("*.so"))
+
+
+def test_a_stop_ends_everything_after_one_gradient():
+    objective = over_box(rosenbrock, [-2, -2, -2], [2, 2, 2])
+    situation = objective.situation({})
+    function = situation.build.function
+    start = np.array([-1.2, 1.0, 0.7])
+    for kernel in (InterpretedKernel(function), CompiledKernel(function, toolchain.find_compiler())):
+        stop = Stop()
+        bound = kernel.bind(situation.shared, *objective.bounds, stop)
+        assert len(bound.climb(start, NONE, 500, 1e-10).history) > 10
+        stop.set()
+        for ended in (bound.climb(start, NONE, 500, 1e-10), bound.ascend(start, NONE, 500, steps_of())):
+            assert ended.outcome == "time limit"
+            assert len(ended.history) == 1
+            np.testing.assert_allclose(ended.point, start, atol=1e-15)
+        values, gradients = bound.evaluate(np.array([start] * 3), np.zeros((3, 0)))
+        assert np.isfinite(values).tolist() == [True, False, False]
+        assert np.isfinite(gradients[0]).all()
+        elsewhere = pickle.loads(pickle.dumps(bound))  # another process has its own
+        assert len(elsewhere.climb(start, NONE, 500, 1e-10).history) > 10

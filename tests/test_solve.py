@@ -366,3 +366,38 @@ def test_nothing_finite_and_nobody_left_to_say_why(monkeypatch):
 def test_nothing_is_printed_where_nobody_looks(capfd, progress):
     sg.solve(task(), STATE, progress=progress)
     assert capfd.readouterr() == ("", "")
+
+
+# Time
+
+
+@pytest.mark.parametrize(
+    "optimizer",
+    [sg.Lbfgs(starts=10**4), sg.Adadelta(starts=10**4), sg.Ipopt(), sg.Enumerate(sg.Lbfgs(starts=10**4)), sg.Bonmin()],
+    ids=lambda optimizer: type(optimizer).__name__,
+)
+def test_no_time_is_enough_for_a_plan(objective, optimizer):
+    plan = sg.solve(objective, STATE, optimizer, time_limit=0)
+    assert np.isfinite(plan.value)
+    assert 1 <= len(plan.runs) < 10**4
+    assert plan.value == pytest.approx(objective.value(STATE, plan.actions, plan.selections))
+
+
+def test_when_time_is_over_the_best_so_far_is_returned(objective):
+    full = sg.solve(objective, STATE)
+    plan = sg.solve(objective, STATE, sg.Lbfgs(starts=10**6, samples=1), time_limit=0.3)
+    assert plan.status.startswith("time limit: best of ")
+    assert plan.value <= full.value + 1e-9
+    assert sg.solve(objective, STATE, time_limit=60).status == full.status
+    for wrong in (-1, float("nan"), "1", True):
+        refuses(
+            lambda wrong=wrong: sg.solve(objective, STATE, time_limit=wrong), sg.InputError, f"time_limit = {wrong!r}"
+        )
+
+
+def test_combinations_that_time_did_not_allow_are_told():
+    slots = {"u": sg.Action(low=0, high=1)} | {f"s{k}": sg.Selection(["a", "b"]) for k in range(12)}
+    graph = sg.Graph(slots, start="here")
+    graph.reward("here", lambda u: -((u - 0.5) ** 2))
+    plan = sg.solve(objective_of(graph), {}, sg.Enumerate(), time_limit=0)
+    assert "of 4096 combinations of selections" in plan.status

@@ -11,7 +11,7 @@ from typing import Any, get_args
 import casadi as ca
 import numpy as np
 
-from symgraph.compile.kernel import AdadeltaSteps, BoundKernel, Ended, Kernel, Outcome
+from symgraph.compile.kernel import NEVER, AdadeltaSteps, BoundKernel, Ended, Kernel, Outcome, Stop
 from symgraph.compile.toolchain import load
 from symgraph.errors import CompileError
 from symgraph.slots import Array
@@ -19,7 +19,7 @@ from symgraph.slots import Array
 # The point-by-point call of CasADi's function, between that and search.c.
 _HEAD = """
 #define N_ACTIONS {n_actions}
-struct inputs {{ const double *selections; const double *const *shared; double *w; }};
+struct inputs {{ const double *selections; const double *const *shared; const volatile int *stop; double *w; }};
 static int evaluate(const double *x, const struct inputs *in, double *value, double *gradient) {{
   const double *arg[{arguments}];
   double *res[{results}];
@@ -37,32 +37,36 @@ static int evaluate(const double *x, const struct inputs *in, double *value, dou
 # What Python calls, after search.c. Workspace: first CasADi's, then the search's.
 _TAIL = """
 void symgraph_evaluate(long long points, const double *actions, const double *selections, const double *const *shared,
-                       double *values, double *gradients, double *w) {{
+                       const int *stop, double *values, double *gradients, double *w) {{
   struct inputs in;
   long long p;
   in.shared = shared;
+  in.stop = stop;
   in.w = w;
   for (p = 0; p < points; ++p) {{
     in.selections = selections + p * {n_selections};
-    if (evaluate(actions + p * N_ACTIONS, &in, values + p, gradients + p * N_ACTIONS)) values[p] = NAN;
+    if ((p && *in.stop) || evaluate(actions + p * N_ACTIONS, &in, values + p, gradients + p * N_ACTIONS))
+      values[p] = NAN;
   }}
 }}
-long long symgraph_climb(double *x, const double *selection, const double *const *shared, const double *low,
-                         const double *high, long long iterations, double tolerance, double *value, int *outcome,
-                         double *history, double *w) {{
+long long symgraph_climb(double *x, const double *selection, const double *const *shared, const int *stop,
+                         const double *low, const double *high, long long iterations, double tolerance,
+                         double *value, int *outcome, double *history, double *w) {{
   struct inputs in;
   in.selections = selection;
   in.shared = shared;
+  in.stop = stop;
   in.w = w;
   return climb(x, &in, low, high, iterations, tolerance, value, outcome, history, w + {work});
 }}
-long long symgraph_ascend(double *x, const double *selection, const double *const *shared, const double *low,
-                          const double *high, long long limit, double decay, double epsilon, double tolerance,
-                          double scale, int oscillation, int scaled, int keep_best, double *value, int *outcome,
-                          double *history, double *w) {{
+long long symgraph_ascend(double *x, const double *selection, const double *const *shared, const int *stop,
+                          const double *low, const double *high, long long limit, double decay, double epsilon,
+                          double tolerance, double scale, int oscillation, int scaled, int keep_best,
+                          double *value, int *outcome, double *history, double *w) {{
   struct inputs in;
   in.selections = selection;
   in.shared = shared;
+  in.stop = stop;
   in.w = w;
   return ascend(x, &in, low, high, limit, decay, epsilon, tolerance, scale, oscillation, scaled, keep_best, value,
                 outcome, history, w + {work});
@@ -104,12 +108,12 @@ class CompiledKernel(Kernel):
         pointer: Any = ctypes.c_void_p
         whole: Any = ctypes.c_longlong
         number: Any = ctypes.c_double
-        library.symgraph_evaluate.argtypes = [whole, *[pointer] * 6]
+        library.symgraph_evaluate.argtypes = [whole, *[pointer] * 7]
         library.symgraph_evaluate.restype = None
-        library.symgraph_climb.argtypes = [*[pointer] * 5, whole, number, *[pointer] * 4]
+        library.symgraph_climb.argtypes = [*[pointer] * 6, whole, number, *[pointer] * 4]
         library.symgraph_climb.restype = whole
         steps = [whole, *[number] * 4, ctypes.c_int, ctypes.c_int, ctypes.c_int]
-        library.symgraph_ascend.argtypes = [*[pointer] * 5, *steps, *[pointer] * 4]
+        library.symgraph_ascend.argtypes = [*[pointer] * 6, *steps, *[pointer] * 4]
         library.symgraph_ascend.restype = whole
         self.code: Any = library
         self.work = int(library.symgraph_work())
@@ -121,16 +125,17 @@ class CompiledKernel(Kernel):
         self.__dict__.update(state)
         self._load()
 
-    def bind(self, shared: Sequence[Array], low: Array, high: Array) -> BoundKernel:
-        return _BoundCompiled(self, [contiguous(column) for column in shared], contiguous(low), contiguous(high))
+    def bind(self, shared: Sequence[Array], low: Array, high: Array, stop: Stop = NEVER) -> BoundKernel:
+        columns = [contiguous(column) for column in shared]
+        return _BoundCompiled(self, columns, contiguous(low), contiguous(high), stop)
 
 
 class _BoundCompiled(BoundKernel):
     """Hands arrays of its own to the library, since looking up an array's address costs as much as ten gradients."""
 
-    def __init__(self, kernel: CompiledKernel, shared: list[Array], low: Array, high: Array) -> None:
+    def __init__(self, kernel: CompiledKernel, shared: list[Array], low: Array, high: Array, stop: Stop) -> None:
         self._kernel = kernel
-        self._inputs = shared, low, high
+        self._inputs = shared, low, high, stop
         self._pointers = (ctypes.c_void_p * max(1, len(shared)))(*[_address(column) for column in shared])
         self._work = np.empty(kernel.work)
         self._point, self._selection = np.zeros(kernel.n_actions), np.zeros(kernel.n_selections)
@@ -140,6 +145,7 @@ class _BoundCompiled(BoundKernel):
             _address(self._point),
             _address(self._selection),
             ctypes.addressof(self._pointers),
+            stop.address,
             _address(low),
             _address(high),
         )
@@ -155,6 +161,7 @@ class _BoundCompiled(BoundKernel):
             _address(actions),
             _address(selections),
             ctypes.addressof(self._pointers),
+            self._inputs[3].address,
             _address(values),
             _address(gradients),
             _address(self._work),

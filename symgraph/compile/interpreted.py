@@ -9,7 +9,7 @@ from typing import Any, cast
 import casadi as ca
 import numpy as np
 
-from symgraph.compile.kernel import AdadeltaSteps, BoundKernel, Ended, Kernel, Outcome
+from symgraph.compile.kernel import NEVER, AdadeltaSteps, BoundKernel, Ended, Kernel, Outcome, Stop
 from symgraph.slots import Array
 
 # The search of search.c, step for step: its constants.
@@ -61,20 +61,23 @@ class InterpretedKernel(Kernel):
     def __init__(self, function: ca.Function) -> None:
         self.function = FlatFunction(function)
 
-    def bind(self, shared: Sequence[Array], low: Array, high: Array) -> BoundKernel:
-        return _BoundInterpreted(self.function, list(shared), low, high)
+    def bind(self, shared: Sequence[Array], low: Array, high: Array, stop: Stop = NEVER) -> BoundKernel:
+        return _BoundInterpreted(self.function, list(shared), low, high, stop)
 
 
 class _BoundInterpreted(BoundKernel):
-    def __init__(self, function: FlatFunction, shared: list[Array], low: Array, high: Array) -> None:
+    def __init__(self, function: FlatFunction, shared: list[Array], low: Array, high: Array, stop: Stop) -> None:
         self._function = function
         self._shared = shared
         self._low = low
         self._high = high
+        self._stop = stop
 
     def evaluate(self, actions: Array, selections: Array) -> tuple[Array, Array]:
-        values, gradients = np.empty(len(actions)), np.empty(actions.shape)
+        values, gradients = np.full(len(actions), np.nan), np.full(actions.shape, np.nan)
         for p in range(len(actions)):
+            if p and self._stop:
+                break
             values[p], gradients[p] = self._at(actions[p], selections[p])
         return values, gradients
 
@@ -102,6 +105,8 @@ class _BoundInterpreted(BoundKernel):
         while True:
             noise = SMALLEST_GAIN * abs(f)
             accepted = False
+            if self._stop:
+                iterations, outcome = len(history), "time limit"
             if fresh:
                 free = ~((span <= 0.0) | ((u <= 0.0) & (g > 0.0)) | ((u >= 1.0) & (g < 0.0)))
                 slope = float(np.abs(g * free).max(initial=0.0))
@@ -175,6 +180,9 @@ class _BoundInterpreted(BoundKernel):
         history = [value]
         outcome: Outcome = "iteration limit"
         while len(history) <= limit:
+            if self._stop:
+                outcome = "time limit"
+                break
             before, last = value, x
             slope = gradient * span / steps.scale
             v = steps.decay * v + (1.0 - steps.decay) * slope * slope

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +10,38 @@ from typing import Literal
 
 from symgraph.slots import Array
 
-Outcome = Literal["converged", "iteration limit", "oscillation", "stalled", "not finite", "worker died", "drawn"]
+Outcome = Literal[
+    "converged", "iteration limit", "oscillation", "stalled", "not finite", "time limit", "worker died", "drawn"
+]
+
+
+class Stop:
+    """Ends searches early; may be set from another thread. In another process it is never set.
+
+    Args:
+        seconds: after which it will be set, None if nobody means to.
+    """
+
+    def __init__(self, seconds: float | None = None) -> None:
+        self.seconds = seconds
+        self._flag = ctypes.c_int(0)
+
+    @property
+    def address(self) -> int:
+        """Of an int that is not 0 once it is set."""
+        return ctypes.addressof(self._flag)
+
+    def set(self) -> None:
+        self._flag.value = 1
+
+    def __bool__(self) -> bool:
+        return bool(self._flag.value)
+
+    def __reduce__(self) -> tuple[type[Stop], tuple[()]]:
+        return Stop, ()
+
+
+NEVER = Stop()  # stays unset
 
 
 @dataclass(frozen=True)
@@ -54,7 +86,7 @@ class BoundKernel(ABC):
             selections: (P, m) one-hot rows.
 
         Returns:
-            values (P,) and gradients (P, n); not finite where the model is not.
+            values (P,) and gradients (P, n); not finite where the model is not, or where it was stopped before.
         """
 
     @abstractmethod
@@ -82,11 +114,12 @@ class Kernel(ABC):
     """Value (1, 1) and gradient (n, 1) as a function of actions (n, 1), selections (m, 1) and further columns."""
 
     @abstractmethod
-    def bind(self, shared: Sequence[Array], low: Array, high: Array) -> BoundKernel:
+    def bind(self, shared: Sequence[Array], low: Array, high: Array, stop: Stop = NEVER) -> BoundKernel:
         """Put in what a search does not change.
 
         Args:
             shared: the inputs after actions and selections, each flat in column-major order.
             low: (n,) lower bounds of the actions.
             high: (n,) upper bounds; an action with low = high is held there.
+            stop: ends a search, and an evaluation of many points, after at least one gradient.
         """

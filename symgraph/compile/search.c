@@ -2,13 +2,13 @@
 
    C99, libm only, no allocation, no globals. The file that includes this one defines
      N_ACTIONS                  number of stacked actions
-     struct inputs              what evaluate() needs besides the actions
+     struct inputs              what evaluate() needs besides the actions, and `stop`: not 0 once time is over
      int evaluate(const double *x, const struct inputs *in, double *value, double *gradient)
                                 returns 0, or 1 where the model failed
    interpreted.py does the same, step for step, where there is no compiler: change both.
    Bounds are low[N_ACTIONS], high[N_ACTIONS]; an action with low == high is held. */
 
-enum outcome { CONVERGED, ITERATION_LIMIT, OSCILLATION, STALLED, NOT_FINITE };
+enum outcome { CONVERGED, ITERATION_LIMIT, OSCILLATION, STALLED, NOT_FINITE, TIME_LIMIT };
 
 #define PAIRS (N_ACTIONS < 8 ? (N_ACTIONS > 0 ? N_ACTIONS : 1) : 8) /* curvature pairs that L-BFGS keeps */
 #define SEARCH_WORK (2 * PAIRS * N_ACTIONS + 11 * N_ACTIONS + 1)          /* doubles of workspace */
@@ -145,6 +145,10 @@ static long long climb(double *x, const struct inputs *in, const double *low, co
   for (;;) {
     double predicted = 0, slope_trial = 0, noise = SMALLEST_GAIN * fabs(f);
     int finite, gained, accepted = 0;
+    if (*in->stop) {
+      iterations = spent;
+      *outcome = TIME_LIMIT;
+    }
     if (fresh) {
       slope = 0;
       for (i = 0; i < N_ACTIONS; ++i) {
@@ -281,6 +285,10 @@ static long long ascend(double *x, const struct inputs *in, const double *low, c
   }
   best_value = j;
   while (step < limit) {
+    if (*in->stop) {
+      *outcome = TIME_LIMIT;
+      break;
+    }
     before = j;
     for (i = 0; i < N_ACTIONS; ++i) {
       double span = scaled ? high[i] - low[i] : 1, slope = g[i] * span / scale, delta;

@@ -122,7 +122,13 @@ class Adadelta(Optimizer):
         interrupted = False
         try:
             with _movers(self.processes) as move:
-                while len(finished) < wanted and queue.waiting and spent < total and deaths <= MAX_DEATHS:
+                while (
+                    len(finished) < wanted
+                    and queue.waiting
+                    and spent < total
+                    and deaths <= MAX_DEATHS
+                    and not (ended and problem.stop)
+                ):
                     # One point at a time, or a few per process, since handing them over has its price.
                     most = 1 if self.processes == 1 else RUNS_PER_TASK * self.processes
                     batch = queue.pop(min(most, wanted - len(finished)), finished)
@@ -143,7 +149,7 @@ class Adadelta(Optimizer):
                     problem.progress.update(max(spent / total, len(finished) / wanted), 1.0)
         except KeyboardInterrupt:
             interrupted = True
-        if self.polish and not interrupted:
+        if self.polish and not interrupted and not problem.stop:
             polished, interrupted = self._polished(problem, ended)
             ended = [*map(problem.judge, ended), *polished]
         else:
@@ -172,10 +178,10 @@ class Adadelta(Optimizer):
         points = np.array([run.point for run in chosen])
         choices = np.array([run.choices for run in chosen])
         iterations = POLISH_ITERATIONS if problem.constrained is None else CONSTRAINED_ITERATIONS
-        polished = climbed(problem, points, choices, iterations, 1e-9)
+        polished, interrupted = climbed(problem, points, choices, iterations, 1e-9)
         for before, after in zip(chosen, polished, strict=False):
             after.start = before.start
-        return polished, len(polished) < len(chosen)
+        return polished, interrupted
 
 
 class _Queue:

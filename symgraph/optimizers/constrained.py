@@ -18,7 +18,7 @@ from symgraph.slots import Array, Choices
 
 MET = 1e-6  # what may be missed of a requirement, in units of how much its margin varies over the bounds
 CLOSE = 1e-10  # as MET, what a search goes on to
-FIRST_WEIGHT = 10.0
+FIRST_WEIGHT = 1000.0  # less lets a climb leave for where nothing leads back to what is required
 GROWTH = 10.0  # of weights
 ENOUGH = 0.25  # of what was missed before: while that much less is missed each time, weights stay
 LARGEST_WEIGHT = 1e12
@@ -113,7 +113,8 @@ class Constrained:
             moved = np.where(self._equality, margins, np.maximum(margins, -multipliers / np.maximum(weights, 1e-300)))
             wrong = float(np.abs(np.where(weights > 0.0, moved / spread, 0.0)).max(initial=0.0))
             settled = slack <= tolerance and wrong <= CLOSE
-            if settled or left <= 0 or len(history) > ROUNDS or weights.max() > LARGEST_WEIGHT * scale:
+            over = left <= 0 or ended.outcome == "time limit"
+            if settled or over or len(history) > ROUNDS or weights.max() > LARGEST_WEIGHT * scale:
                 ended.history = np.concatenate(history)
                 return ended, float(self.missed(margins, choice))
             multipliers = np.where(self._equality, pulled, np.maximum(pulled, 0.0))

@@ -13,7 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from symgraph.compile.kernel import Outcome
+from symgraph.compile.kernel import NEVER, Outcome, Stop
 from symgraph.objective import Build
 from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
 from symgraph.optimizers.settings import number, positive_whole
@@ -66,6 +66,8 @@ class Ipopt(Optimizer):
         problem.progress.wait("planning")
         with _interrupts() as interrupted:
             for point, choice in zip(points, choices, strict=True):
+                if runs and problem.stop:
+                    break
                 run = self._from(problem, point, choice, interrupted)
                 if interrupted:
                     return Search(runs, "", interrupted=True)
@@ -83,7 +85,7 @@ class Ipopt(Optimizer):
         if problem.n == 0:
             return Run(point, point, choice, start_value, "converged", np.array([start_value]))
         situation = problem.cut(choice)
-        solver = self._solver(situation.build, interrupted)
+        solver = self._solver(situation.build, interrupted, problem.stop)
         scale = problem.scale(choice)
         least = [0.0 if one.is_equality else -np.inf for one in situation.build.expectation.constraints]
         found = solver(
@@ -95,7 +97,7 @@ class Ipopt(Optimizer):
             p=np.concatenate([hot[0], *situation.shared, [scale]]),
         )
         statistics = solver.stats()
-        outcome = _OUTCOMES.get(str(statistics["return_status"]), "stalled")
+        outcome = "time limit" if problem.stop else _OUTCOMES.get(str(statistics["return_status"]), "stalled")
         history = -scale * np.array(statistics.get("iterations", {}).get("obj", [-start_value / scale]))
         end = np.clip(np.array(found["x"]).ravel(), problem.low, problem.high)
         runs = [
@@ -105,7 +107,7 @@ class Ipopt(Optimizer):
         # Not finite half-way, or gone astray: then the start is the better plan.
         return best_of(runs) or runs[1]
 
-    def _solver(self, build: Build, interrupted: list[int]) -> ca.Function:
+    def _solver(self, build: Build, interrupted: list[int], stop: Stop) -> ca.Function:
         """Return IPOPT on −J/scale over the actions, held to the constraints, for the other inputs and the scale."""
         key = Ipopt, self.iterations, self.tolerance
         if key not in build.kept:
@@ -130,16 +132,17 @@ class Ipopt(Optimizer):
             build.kept[key] = ca.nlpsol("ipopt", "ipopt", problem, options), watch
         solver: ca.Function
         solver, watch = build.kept[key]
-        watch.interrupted = interrupted
+        watch.interrupted, watch.stop = interrupted, stop
         return solver
 
 
 class _Watch(ca.Callback):
-    """Is called after each iteration of IPOPT and ends it after Ctrl-C."""
+    """Is called after each iteration of IPOPT and ends it after Ctrl-C or when time is over."""
 
     def __init__(self, n_actions: int, n_parameters: int, n_constraints: int) -> None:
         ca.Callback.__init__(self)
         self.interrupted: list[int] = []
+        self.stop = NEVER
         self._sizes = {"x": n_actions, "lam_x": n_actions, "f": 1, "lam_p": n_parameters}
         self._sizes |= {"g": n_constraints, "lam_g": n_constraints}
         self.construct("watch", {})
@@ -161,7 +164,7 @@ class _Watch(ca.Callback):
         return ca.Sparsity.dense(size, 1) if size else ca.Sparsity(0, 0)
 
     def eval(self, arguments: Sequence[ca.DM]) -> list[ca.DM]:
-        return [ca.DM(len(self.interrupted))]
+        return [ca.DM(len(self.interrupted) + bool(self.stop))]
 
 
 @contextmanager

@@ -45,5 +45,5 @@ class Lbfgs(Optimizer):
         if problem.guesses:
             guessed, guessed_choices = problem.started_from_guesses(rng)
             points, choices = np.concatenate([guessed, points]), np.concatenate([guessed_choices, choices])
-        runs = climbed(problem, points, choices, self.iterations, self.tolerance)
-        return Search(runs, status_of(problem, runs, len(points)), interrupted=len(runs) < len(points))
+        runs, interrupted = climbed(problem, points, choices, self.iterations, self.tolerance)
+        return Search(runs, status_of(problem, runs, len(points)), interrupted)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from symgraph.compile.kernel import BoundKernel, Ended, Outcome
+from symgraph.compile.kernel import NEVER, BoundKernel, Ended, Outcome, Stop
 from symgraph.objective import Situation
 from symgraph.optimizers.constrained import MET, Constrained
 from symgraph.progress import Progress
@@ -35,6 +35,7 @@ class Problem:
         guesses: start points from the user, each (n,) actions (NaN: not given) and (s,) choices (-1: not given).
         progress: to report to.
         constrained: the requirements, None if there are none.
+        stop: set when time is over: searches end with what they have.
     """
 
     kernel: BoundKernel
@@ -47,6 +48,7 @@ class Problem:
     guesses: tuple[tuple[Array, Choices], ...] = ()
     progress: Progress = field(default_factory=lambda: Progress("planning", shown=False))
     constrained: Constrained | None = None
+    stop: Stop = NEVER
     _scales: dict[bytes, float] = field(default_factory=dict)
 
     @property

@@ -19,17 +19,21 @@ def status_of(problem: Problem, runs: list[Run], starts: int) -> str:
     return f"best of {starts} starts, which tried {tried} of {problem.combinations} combinations of selections"
 
 
-def climbed(problem: Problem, points: Array, choices: Choices, iterations: int, tolerance: float) -> list[Run]:
-    """Climb from points (P, n) under choices (P, s); an interrupt ends it with the runs so far."""
+def climbed(
+    problem: Problem, points: Array, choices: Choices, iterations: int, tolerance: float
+) -> tuple[list[Run], bool]:
+    """Climb from points (P, n) under choices (P, s); return the runs, and whether an interrupt ended it before all."""
     hot = problem.one_hot(choices)
     runs: list[Run] = []
     try:
         for p in range(len(points)):
+            if p and problem.stop:
+                break
             runs.append(_climbed(problem, points[p], choices[p], hot[p], iterations, tolerance))
             problem.progress.update(p + 1, len(points))
     except KeyboardInterrupt:
-        pass
-    return runs
+        return runs, True
+    return runs, False
 
 
 def _climbed(problem: Problem, start: Array, choice: Choices, hot: Array, iterations: int, tolerance: float) -> Run:
