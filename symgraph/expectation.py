@@ -26,6 +26,7 @@ import casadi as ca
 from symgraph.binding import REQUIREMENT, REWARD, BoundModel
 from symgraph.constraints import Constraint, constraints_of, merit
 from symgraph.model import Parameter
+from symgraph.requirement import SMALLEST_VARIANCE
 from symgraph.slots import Gaussian, State
 from symgraph.structure import Structure, is_open
 from symgraph.tree import Tree, TreeBranch, TreeGroup
@@ -130,7 +131,7 @@ class Expectation:
         return ca.Function("hessian", self.inputs.symbols, [ca.densify(ca.hessian(self.value, self.inputs.actions)[0])])
 
 
-def expected_value(tree: Tree, uncertain: frozenset[str], relaxed: bool = False) -> Expectation:
+def expected_value(tree: Tree, uncertain: frozenset[str], relaxed: bool = False, risk: float = 0.0) -> Expectation:
     """Write down the expected sum of rewards of a tree.
 
     Args:
@@ -138,19 +139,22 @@ def expected_value(tree: Tree, uncertain: frozenset[str], relaxed: bool = False)
         uncertain: the start states that come with a covariance; for the others no covariance enters the expression.
         relaxed: selections may be anything between their choices: a branch's value and margins are weighed with its
             element of the one-hot column, as if it were a probability, so that derivatives by selections exist.
+        risk: how many standard deviations of the sum of rewards are taken from its mean. Rewards on the way through the
+            tree count as independent of each other, as slots do.
 
     Source: Yamaguchi & Atkeson, Humanoids 2016, equations (1)–(4).
     """
-    return _Writer(tree, Inputs(tree, uncertain), relaxed).run()
+    return _Writer(tree, Inputs(tree, uncertain), relaxed, risk).run()
 
 
 class _Writer:
     """Writes the expression: dictionaries from the root to the leaves, values from the leaves to the root."""
 
-    def __init__(self, tree: Tree, inputs: Inputs, relaxed: bool) -> None:
+    def __init__(self, tree: Tree, inputs: Inputs, relaxed: bool, risk: float) -> None:
         self._tree = tree
         self._inputs = inputs
         self._relaxed = relaxed
+        self._risk = risk
         self._structure = Structure(tree)
         self._functions: dict[tuple[Any, ...], ca.Function] = {}
 
@@ -163,10 +167,13 @@ class _Writer:
                 for branch in group.branches:
                     if branch.child is not None and self._structure.apart[branch.child]:
                         self._write_function(branch, uncertain[node.index])
-        value, margins, instructions = self._value(0, self._inputs.root)
+        worth, instructions = self._worth(0, self._inputs.root)
+        value = worth.value
+        if self._risk:
+            value = value - self._risk * ca.sqrt(ca.fmax(worth.variance, SMALLEST_VARIANCE))
+        margins = ca.vertcat(*worth.margins) if worth.margins else ca.MX(0, 1)
         constraints = constraints_of(self._tree)
-        stacked = ca.vertcat(*margins) if margins else ca.MX(0, 1)
-        return Expectation(self._inputs, ca.densify(value), stacked, constraints, instructions <= FLATTEN_LIMIT)
+        return Expectation(self._inputs, ca.densify(value), margins, constraints, instructions <= FLATTEN_LIMIT)
 
     def _uncertain_labels(self) -> list[frozenset[str]]:
         found = [frozenset[str]()] * len(self._tree.nodes)
@@ -195,8 +202,8 @@ class _Writer:
             here[label] = Gaussian(mean, covariance)
             symbols += [mean] if covariance is None else [mean, covariance]
         written, own = _apply(branch.branch.model, here)
-        value, margins, instructions = self._value(branch.child or 0, {**here, **written})
-        results = [ca.densify(value), *([ca.densify(ca.vertcat(*margins))] if margins else [])]
+        worth, instructions = self._worth(branch.child or 0, {**here, **written})
+        results = self._results(worth)
         name = f"branch_{len(self._functions)}"
         inputs = symbols + self._shared_symbols
         # Nobody asks for derivatives by selections and weights, and the reverse sweep would compute them.
@@ -226,24 +233,26 @@ class _Writer:
         inputs = self._inputs
         return [inputs.actions, inputs.selections, *(parameter.symbol for parameter in inputs.parameters)]
 
-    def _value(self, root: int, dictionary: Dictionary) -> tuple[ca.MX, list[ca.MX], float]:
-        """Write the value and the margins of a subtree, up to the branches that stand apart; count instructions too."""
+    def _worth(self, root: int, dictionary: Dictionary) -> tuple[_Worth, float]:
+        """Write what a subtree is worth, up to the branches that stand apart; also count scalar instructions."""
         instructions = 0.0
         dictionaries = {root: dictionary}
         order = [root]  # grows while it is walked
-        terms: dict[int, list[tuple[ca.MX | float, list[ca.MX] | int]]] = {}  # node → (probability, results or child)
+        groups: dict[int, list[list[tuple[ca.MX | float, _Worth | int]]]] = {}  # node → (probability, worth or child)
         margins: dict[int, list[ca.MX]] = {}
         for index in order:
             here = dictionaries.pop(index)
-            terms[index], margins[index] = [], []
+            groups[index], margins[index] = [], []
             for requirement in self._tree.nodes[index].requirements:
                 outcome, count = _apply(requirement.model, here)
                 instructions += count
                 margins[index] += requirement.margins(outcome[REQUIREMENT])
             for group in self._tree.nodes[index].groups:
+                terms: list[tuple[ca.MX | float, _Worth | int]] = []
+                groups[index].append(terms)
                 if is_open(group):
                     instructions = math.inf
-                    terms[index].append((1.0, (self._blend if self._relaxed else self._switch)(group, here)))
+                    terms.append((1.0, (self._blend if self._relaxed else self._switch)(group, here)))
                     continue
                 model = group.group.probability
                 shares, count = _apply(model if isinstance(model, BoundModel) else None, here)
@@ -255,44 +264,54 @@ class _Writer:
                     if branch.child is not None and self._structure.apart[branch.child]:
                         instructions = math.inf
                         function, arguments = self._call(branch, here)
-                        terms[index].append((probability, function.call(arguments)))
+                        terms.append((probability, self._worth_of(function.call(arguments))))
                         continue
                     written, count = _apply(branch.branch.model, here)
                     instructions += count + 2
                     if branch.child is None:
-                        terms[index].append((probability, [written[REWARD].mean]))
+                        reward = written[REWARD]
+                        terms.append((probability, _Worth(reward.mean, ca.densify(reward.covariance), [])))
                     else:
                         dictionaries[branch.child] = {**here, **written}
                         order.append(branch.child)
-                        terms[index].append((probability, branch.child))
-        values: dict[int, ca.MX] = {}
+                        terms.append((probability, branch.child))
+        worths: dict[int, _Worth] = {}
         for index in reversed(order):
-            total = ca.MX(self._tree.cut_value if self._tree.nodes[index].cut else 0.0)
-            for probability, term in terms[index]:
-                value, *below = [values.pop(term), *margins.pop(term)] if isinstance(term, int) else term
-                certain = isinstance(probability, float) and probability == 1.0
-                total = total + (value if certain else probability * value)
-                margins[index] += below
-            values[index] = total
-        return values[root], margins[root], instructions
+            total = _Worth(ca.MX(self._tree.cut_value if self._tree.nodes[index].cut else 0.0), ca.MX(0.0), [])
+            total.margins += margins[index]
+            for terms in groups[index]:
+                total.add(_mixed([(p, worths.pop(term) if isinstance(term, int) else term) for p, term in terms]))
+            worths[index] = total
+        return worths[root], instructions
 
-    def _blend(self, group: TreeGroup, here: Dictionary) -> list[ca.MX]:
+    def _results(self, worth: _Worth) -> list[ca.MX]:
+        """Return what a function of a branch hands on: value, variance if it is asked for, margins if there are any."""
+        variance = [ca.densify(worth.variance)] if self._risk else []
+        margins = [ca.densify(ca.vertcat(*worth.margins))] if worth.margins else []
+        return [ca.densify(worth.value), *variance, *margins]
+
+    def _worth_of(self, results: list[ca.MX]) -> _Worth:
+        """Read what `_results` returned."""
+        value, *rest = results
+        return _Worth(value, rest.pop(0) if self._risk else ca.MX(0.0), rest)
+
+    def _blend(self, group: TreeGroup, here: Dictionary) -> _Worth:
         """Write a choice whose selection may be anything between its choices."""
         shares = ca.vertsplit(self._inputs.root[str(group.group.selection)].mean)
-        total, all_margins = ca.MX(0.0), []
+        terms = []
         for share, branch in zip(shares, group.branches, strict=True):
             function, arguments = self._call(branch, here)
-            value, *margins = function.call(arguments)
-            total += share * value
-            all_margins += [share * margin for margin in margins]
-        return [total, *all_margins]
+            worth = self._worth_of(function.call(arguments))
+            worth.margins = [share * margin for margin in worth.margins]
+            terms.append((share, worth))
+        return _mixed(terms)
 
-    def _switch(self, group: TreeGroup, here: Dictionary) -> list[ca.MX]:
+    def _switch(self, group: TreeGroup, here: Dictionary) -> _Worth:
         """Write a choice: the function of the selected branch, the others not evaluated."""
         slot = self._tree.graph.selections()[str(group.group.selection)]
         calls = [self._call(branch, here) for branch in group.branches]  # in the order of the slot's choices
         if len(calls) == 1:
-            return calls[0][0].call(calls[0][1])
+            return self._worth_of(calls[0][0].call(calls[0][1]))
         # All cases of a switch take the same arguments: those that any of them needs. And all return the margins of all
         # branches, in which those of the others do not count.
         arguments = {argument.__hash__(): argument for _, given in calls for argument in given}
@@ -300,14 +319,42 @@ class _Writer:
         unused = [[one.unused for one in constraints_of(self._tree, branch.child or 0)] for branch in group.branches]
         cases = []
         for i, (function, given) in enumerate(calls):
-            value, *margins = function.call([symbols[argument.__hash__()] for argument in given])
+            worth = self._worth_of(function.call([symbols[argument.__hash__()] for argument in given]))
             before, after = ([ca.MX(ca.DM(part)) for part in parts] for parts in (unused[:i], unused[i + 1 :]))
-            stacked = [ca.densify(ca.vertcat(*before, *margins, *after))] if any(unused) else []
-            cases.append(ca.Function(f"case_{function.name()}", [*symbols.values()], [value, *stacked]))
+            worth.margins = [*before, *worth.margins, *after] if any(unused) else []
+            cases.append(ca.Function(f"case_{function.name()}", [*symbols.values()], self._results(worth)))
         selection = self._inputs.root[str(group.group.selection)].mean
         index = ca.dot(selection, ca.DM(range(slot.size)))
         switch = ca.Function.conditional("choice", cases[:-1], cases[-1])
-        return switch.call([index, *arguments.values()])
+        return self._worth_of(switch.call([index, *arguments.values()]))
+
+
+@dataclass
+class _Worth:
+    """What a subtree is worth: mean and variance of its sum of rewards, and the margins of its requirements."""
+
+    value: ca.MX
+    variance: ca.MX
+    margins: list[ca.MX]
+
+    def add(self, other: _Worth) -> None:
+        """Take in a group that happens side by side, independently."""
+        self.value += other.value
+        self.variance += other.variance
+        self.margins += other.margins
+
+
+def _mixed(terms: list[tuple[ca.MX | float, _Worth]]) -> _Worth:
+    """Return the worth of a group of branches of which one happens: mean and variance of a mixture."""
+    margins = [margin for _, worth in terms for margin in worth.margins]
+    if len(terms) == 1 and isinstance(terms[0][0], float) and terms[0][0] == 1.0:
+        return _Worth(terms[0][1].value, terms[0][1].variance, margins)
+    value, variance = ca.MX(0.0), ca.MX(0.0)
+    for probability, worth in terms:
+        value += probability * worth.value
+    for probability, worth in terms:
+        variance += probability * (worth.variance + (worth.value - value) ** 2)
+    return _Worth(value, variance, margins)
 
 
 def _apply(model: BoundModel | None, here: Dictionary) -> tuple[Dictionary, float]:

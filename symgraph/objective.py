@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,20 +25,21 @@ from symgraph.tree import Tree
 class Build:
     """All that is derived from the tree for one set of uncertain start states, each part when it is first needed."""
 
-    def __init__(self, tree: Tree, uncertain: frozenset[str], compiled: bool) -> None:
+    def __init__(self, tree: Tree, uncertain: frozenset[str], compiled: bool, risk: float) -> None:
         self._tree = tree
         self._uncertain = uncertain
         self._compiled = compiled
+        self._risk = risk
         self.kept: dict[Any, Any] = {}  # what optimizers derive from the expression and use again
 
     @cached_property
     def expectation(self) -> Expectation:
-        return expected_value(self._tree, self._uncertain)
+        return expected_value(self._tree, self._uncertain, risk=self._risk)
 
     @cached_property
     def relaxed(self) -> Expectation:
         """With selections that may be anything between their choices."""
-        return expected_value(self._tree, self._uncertain, relaxed=True)
+        return expected_value(self._tree, self._uncertain, relaxed=True, risk=self._risk)
 
     @cached_property
     def function(self) -> ca.Function:
@@ -116,15 +118,23 @@ class Objective:
     Args:
         tree: what `unroll` returns.
         compiled: evaluate many points in compiled C when there is a compiler; False stays in CasADi's interpreter.
+        risk: J becomes E[Σ rewards] - risk · sd[Σ rewards]; rewards on the way through the tree count as independent of
+            each other, as slots do.
+
+    Raises:
+        InputError: no tree, or a risk that is no finite number.
 
     Source: Yamaguchi & Atkeson, Humanoids 2016, sections II-A to II-C and III.
     """
 
-    def __init__(self, tree: Tree, compiled: bool = True) -> None:
+    def __init__(self, tree: Tree, compiled: bool = True, risk: float = 0.0) -> None:
         if not isinstance(tree, Tree):
             raise InputError(f"Objective takes a tree, got {type(tree).__name__}; write Objective(unroll(graph))")
+        if isinstance(risk, bool) or not isinstance(risk, (int, float, np.number)) or not math.isfinite(risk):
+            raise InputError(f"Objective: risk = {risk!r}; give a finite number of standard deviations, e.g. 1.0")
         self.tree = tree
         self.graph = tree.graph
+        self.risk = float(risk)
         self._compiled = compiled
         self._builds: dict[frozenset[str], Build] = {}
         self._chosen: dict[tuple[str, ...], Objective] = {}
@@ -244,7 +254,8 @@ class Objective:
         key = tuple(selections[label] for label in self.graph.selections())
         if key not in self._chosen:
             tree = self.tree.chosen(selections)
-            self._chosen[key] = self if len(tree.nodes) == len(self.tree.nodes) else Objective(tree, self._compiled)
+            whole = len(tree.nodes) == len(self.tree.nodes)
+            self._chosen[key] = self if whole else Objective(tree, self._compiled, self.risk)
         return self._chosen[key]
 
     @cached_property
@@ -276,7 +287,7 @@ class Objective:
         # A variance of zero is exact: formulas for a spread may not survive it (0 · ∞ where a slope is infinite).
         uncertain = frozenset(label for label in self.tree.needed_states if np.any(given[label].covariance))
         if uncertain not in self._builds:
-            self._builds[uncertain] = Build(self.tree, uncertain, self._compiled)
+            self._builds[uncertain] = Build(self.tree, uncertain, self._compiled, self.risk)
         empty = [np.zeros(0)]
         spread = [label for label in self.tree.needed_states if label in uncertain]
         means = [np.ravel(given[label].mean) for label in self.tree.needed_states]

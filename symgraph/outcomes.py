@@ -26,6 +26,7 @@ class NodeOutcome:
         states: {label: Gaussian} of the states known here [unit].
         reward: expected reward paid here, given that one gets here [reward].
         value: expected sum of the rewards from here on, given that one gets here [reward].
+        deviation: its standard deviation, with rewards on the way independent of each other [reward].
         cut: whether the path ends here because a node recurred too often.
     """
 
@@ -35,6 +36,7 @@ class NodeOutcome:
     states: dict[str, Gaussian]
     reward: float
     value: float
+    deviation: float
     cut: bool
 
 
@@ -74,7 +76,7 @@ def walk(tree: Tree, start: Mapping[str, Moments], selections: dict[str, str], m
     """
     count = len(tree.nodes)
     dictionaries: list[Mapping[str, Moments]] = [start] * count
-    rewards, shares = np.zeros(count), np.ones(count)
+    rewards, variances, shares = np.zeros(count), np.zeros(count), np.ones(count)
     for node in tree.nodes:
         here = dictionaries[node.index]
         for group in node.groups:
@@ -84,7 +86,9 @@ def walk(tree: Tree, start: Mapping[str, Moments], selections: dict[str, str], m
                 model = branch.branch.model
                 written = models(model, here) if model is not None else {}
                 if branch.child is None:
-                    rewards[node.index] += written[REWARD][0][0]
+                    mean, variance = written[REWARD]
+                    rewards[node.index] += mean[0]
+                    variances[node.index] += 0.0 if variance is None else variance[0]
                     continue
                 dictionaries[branch.child] = {**here, **written} if written else here
                 if group.group.kind == "choose":
@@ -93,7 +97,7 @@ def walk(tree: Tree, start: Mapping[str, Moments], selections: dict[str, str], m
                     shares[branch.child] = chances[branch.branch.label][0][0]
                 elif branch.share is not None:
                     shares[branch.child] = branch.share
-    return NodeOutcomes(tree, dictionaries, rewards, shares)
+    return NodeOutcomes(tree, dictionaries, rewards, variances, shares)
 
 
 class NodeOutcomes(Sequence[NodeOutcome]):
@@ -104,11 +108,19 @@ class NodeOutcomes(Sequence[NodeOutcome]):
         shares: (nodes,) probability of each node given its parent.
     """
 
-    def __init__(self, tree: Tree, dictionaries: list[Mapping[str, Moments]], rewards: Array, shares: Array) -> None:
+    def __init__(
+        self,
+        tree: Tree,
+        dictionaries: list[Mapping[str, Moments]],
+        rewards: Array,
+        variances: Array,
+        shares: Array,
+    ) -> None:
         self.tree = tree
         self.shares = shares
         self._dictionaries = dictionaries
         self._rewards = rewards
+        self._reward_variances = variances
 
     def __len__(self) -> int:
         return len(self._dictionaries)
@@ -129,6 +141,7 @@ class NodeOutcomes(Sequence[NodeOutcome]):
             states={label: _gaussian(here[label]) for label in self.tree.graph.states() if label in here},
             reward=float(self._rewards[node.index]),
             value=float(self._values[node.index]),
+            deviation=float(np.sqrt(np.maximum(0.0, self._variances[node.index]))),
             cut=node.cut,
         )
 
@@ -158,6 +171,19 @@ class NodeOutcomes(Sequence[NodeOutcome]):
             if node.parent is not None and self.shares[node.index]:
                 values[node.parent] += self.shares[node.index] * values[node.index]
         return values
+
+    @cached_property
+    def _variances(self) -> Array:
+        """(nodes,) of the sum of rewards from each node on: groups are independent, branches a mixture."""
+        variances = np.zeros(len(self))
+        for node in reversed(self.tree.nodes):
+            variances[node.index] = 0.0 if node.cut else self._reward_variances[node.index]
+            for group in node.groups:
+                children = [b.child for b in group.branches if b.child is not None and self.shares[b.child]]
+                shares, values = self.shares[children], self._values[children]
+                spread = variances[children] + (values - shares @ values) ** 2
+                variances[node.index] += shares @ spread
+        return variances
 
     @property
     def _cut_probability(self) -> float:

@@ -49,7 +49,7 @@ class Plan:
     Attributes:
         actions: {label: float or (size,)} [unit].
         selections: {label: choice}.
-        value: the expected sum of rewards.
+        value: the expected sum of rewards, less what the objective's risk takes away.
         violation: the largest breach of a requirement, in the unit of its model; 0 if all are met.
         status: what is known: "converged", "best of N starts", "time limit: …", "requirements are missed: …",
             "exploring: model 'm' has 2 of 3 samples", …
@@ -74,6 +74,11 @@ class Plan:
     seed: int
     seconds: float
     units: Mapping[str, str]
+
+    @property
+    def deviation(self) -> float:
+        """The standard deviation of the sum of rewards, with rewards on the way independent of each other."""
+        return self.nodes[0].deviation
 
     def __str__(self) -> str:
         lines = [f"{label} = {choice}" for label, choice in self.selections.items()]
@@ -103,6 +108,7 @@ class Plan:
             "selections": dict(self.selections),
             "value": self.value,
             "violation": self.violation,
+            "deviation": self.deviation,
             "status": self.status,
             "notes": list(self.notes),
             "nodes": [
@@ -112,6 +118,7 @@ class Plan:
                     "probability": node.probability,
                     "reward": node.reward,
                     "value": node.value,
+                    "deviation": node.deviation,
                     "cut": node.cut,
                     "states": {label: _plain(gaussian) for label, gaussian in node.states.items()},
                 }
