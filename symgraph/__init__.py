@@ -12,12 +12,14 @@ from symgraph.errors import (
     SymgraphError,
 )
 from symgraph.graph import Graph
+from symgraph.many import solve_many
 from symgraph.model import Model, Parameter, Propagator
 from symgraph.objective import Objective
 from symgraph.optimizers import Adadelta, Bonmin, Enumerate, Ipopt, Lbfgs
 from symgraph.plan import Plan
+from symgraph.plan_table import PlanRow, PlanTable
 from symgraph.planner import solve
-from symgraph.plots import plot_runs, plot_value
+from symgraph.plots import plot_map, plot_runs, plot_value
 from symgraph.slots import Action, Gaussian, Selection, State
 from symgraph.tree import Tree, unroll
 
@@ -38,6 +40,8 @@ __all__ = [
     "Objective",
     "Parameter",
     "Plan",
+    "PlanRow",
+    "PlanTable",
     "Propagator",
     "Selection",
     "SlotError",
@@ -47,9 +51,11 @@ __all__ = [
     "SymgraphError",
     "Tree",
     "learned",
+    "plot_map",
     "plot_runs",
     "plot_value",
     "solve",
+    "solve_many",
     "unroll",
 ]
 

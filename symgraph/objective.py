@@ -62,10 +62,14 @@ class Build:
         return FlatFunction(self.expectation.missed())
 
     @cached_property
+    def kernel_function(self) -> ca.Function:
+        """What searches climb: J and its gradient, of the merit if there are constraints."""
+        return self.expectation.merit_and_gradient() if self.expectation.constraints else self.function
+
+    @cached_property
     def kernel(self) -> Kernel:
-        """Value and gradient at many points, compiled where that is possible; of the merit if there are constraints."""
-        constrained = bool(self.expectation.constraints)
-        return make_kernel(self.expectation.merit_and_gradient() if constrained else self.function, self._compiled)
+        """`kernel_function` at many points, compiled where that is possible."""
+        return make_kernel(self.kernel_function, self._compiled)
 
     @property
     def has_kernel(self) -> bool:

@@ -1,4 +1,4 @@
-"""Pictures of a search: the values of all start points as they climb, and the value around a plan."""
+"""Pictures of plans: start points as they climb, the value around a plan, and what is planned where."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from symgraph.errors import InputError, MissingExtraError, did_you_mean, names
 from symgraph.objective import Objective, stacked_index
 from symgraph.plan import Plan, PlanRun
+from symgraph.plan_table import PlanTable
 from symgraph.slots import Array
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SMALLEST_GAP = 1e-16  # what the logarithmic axis shows for the best value itself
+MAP_MARKERS = "o^sDvP*<>h"
 SHOWN_COMBINATIONS = 8  # curves that one picture still tells apart
 
 
@@ -138,6 +140,57 @@ def _draw_map(
     best = objective.stack_actions(plan.actions)[where]
     axes.plot(*best, "*", color="red", mec="white", ms=13, label=f"plan: {plan.value:.4g}")
     axes.legend(loc="upper left", bbox_to_anchor=(0.0, 1.12), ncols=3, frameon=False)
+
+
+def plot_map(table: PlanTable, x: str | Sequence[float], y: str | Sequence[float]) -> Figure:
+    """Draw what is planned where: a marker for each combination of selections, in the colour of the value.
+
+    Crosses are situations without a plan that means something: none was found, or a model lacks samples.
+
+    Args:
+        table: what `solve_many` returned.
+        x: a column of numbers, e.g. "target[0]", or a number for each row.
+        y: likewise.
+
+    Returns:
+        a matplotlib figure; `figure.axes[0]` holds the map.
+
+    Raises:
+        InputError: a column that is not there, or as many numbers as there are no rows.
+        MissingExtraError: matplotlib is not installed.
+    """
+    places = [_place(table, given, name) for given, name in ((x, "x"), (y, "y"))]
+    figure, axes = _figure("plot_map")
+    values = table.column("value")
+    planned = np.array([np.isfinite(row.value) and not row.status.startswith("exploring") for row in table], dtype=bool)
+    combinations = [_combination(row.selections) for row in table]
+    shown = values[planned]
+    # Ranks rather than values decide the range, so that a single accident does not swallow all colours.
+    low, high = np.quantile(shown, (0.05, 1.0)) if shown.size else (0.0, 1.0)
+    drawn = None
+    for k, combination in enumerate(dict.fromkeys(c for c, ok in zip(combinations, planned, strict=True) if ok)):
+        rows = planned & np.array([one == combination for one in combinations])
+        marker = MAP_MARKERS[k % len(MAP_MARKERS)]
+        label = combination or None
+        first, second = (place[rows] for place in places)
+        drawn = axes.scatter(first, second, c=values[rows], marker=marker, vmin=low, vmax=high, label=label)
+    if not planned.all():
+        first, second = (place[~planned] for place in places)
+        axes.scatter(first, second, color="grey", marker="x", label="no plan")
+    if drawn is not None:
+        figure.colorbar(drawn, ax=axes, label="value", extend="min" if (shown < low).any() else "neither")
+    axes.set_xlabel(x if isinstance(x, str) else "")
+    axes.set_ylabel(y if isinstance(y, str) else "")
+    if any(combinations):
+        figure.legend(loc="outside upper center", ncols=4, frameon=False)
+    return figure
+
+
+def _place(table: PlanTable, given: str | Sequence[float], name: str) -> Array:
+    column = table.column(given) if isinstance(given, str) else np.asarray(given)
+    if column.shape != (len(table),) or column.dtype.kind not in "buif":
+        raise InputError(f"plot_map: {name} = {given!r} gives no number for each of {len(table)} rows")
+    return column.astype(float)
 
 
 def _figure(what: str) -> tuple[Figure, Axes]:

@@ -41,6 +41,8 @@ LAYERS = [
     "exploration",
     "plan",
     "planner",
+    "plan_table",
+    "many",
     "plots",
     "codegen",
     "learned",
