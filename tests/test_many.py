@@ -1,4 +1,4 @@
-"""solve_many: the same plans as one after the other, in processes, on a cluster, kept in a file, as a table, as a map."""
+"""solve_many: the same plans as one by one, in processes, on a cluster, kept in a file, as a table, as a map."""
 
 import json
 import os
