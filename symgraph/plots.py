@@ -161,6 +161,8 @@ def plot_map(table: PlanTable, x: str | Sequence[float], y: str | Sequence[float
     """
     places = [_place(table, given, name) for given, name in ((x, "x"), (y, "y"))]
     figure, axes = _figure("plot_map")
+    from matplotlib.collections import PathCollection
+
     values = table.column("value")
     planned = np.array([np.isfinite(row.value) and not row.status.startswith("exploring") for row in table], dtype=bool)
     combinations = [_combination(row.selections) for row in table]
@@ -182,7 +184,11 @@ def plot_map(table: PlanTable, x: str | Sequence[float], y: str | Sequence[float
     axes.set_xlabel(x if isinstance(x, str) else "")
     axes.set_ylabel(y if isinstance(y, str) else "")
     if any(combinations):
-        figure.legend(loc="outside upper center", ncols=4, frameon=False)
+        legend = figure.legend(loc="outside upper center", ncols=4, frameon=False)
+        for handle in legend.legend_handles:  # colours mean values, also those that stand in the legend by chance
+            if isinstance(handle, PathCollection):
+                handle.set_array(None)
+                handle.set_color("grey")
     return figure
 
 

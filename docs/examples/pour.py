@@ -42,6 +42,7 @@ from sims.pouring.rendering import RecordedWorld, write_video
 
 PROOFS = 6  # situations at the end that it has never met
 EXPLORED = 50  # episodes in which it tries something beside its plans
+OPTIMIZER = sg.Lbfgs(starts=8, iterations=60)
 
 # %%
 # The task and the loop
@@ -61,7 +62,7 @@ def loop_in(world, name, options, folder):
         folder,
         **pouring.TRIALS,
         limits=pouring.LIMITS,
-        optimizer=sg.Lbfgs(starts=8, iterations=60),
+        optimizer=OPTIMIZER,
         seed=options["seed"],
     )
 
@@ -162,26 +163,22 @@ def prove(loop, world, progress):
 # too little to plan. Dots below are the episodes that it has learned from.
 
 
-def draw_map(loop, setup, target, path, progress):
+def draw_map(loop, setup, target, path):
     materials, mouth = np.atleast_1d(setup["material"]).tolist(), setup["mouth"]
-    situations = list(itertools.product(enumerate(materials), np.unique(np.linspace(np.min(mouth), np.max(mouth), 8))))
+    situations = list(itertools.product(range(len(materials)), np.unique(np.linspace(np.min(mouth), np.max(mouth), 8))))
     if len(situations) == 1:
         return
-    figure, axes = plt.subplots(figsize=(8, 1.2 + 0.5 * len(materials)), layout="constrained")
-    returns = plt.cm.ScalarMappable(plt.Normalize(-2, 0))
-    for (j, material), at in progress.track(situations, description="drawing the skill map"):
-        plan = loop.plan(PouringWorld(material, float(at), target, receiver_x=0.8).reset(0))
-        if plan.status.startswith("interrupted"):
-            raise KeyboardInterrupt
-        marker, colour = {"tip": "o", "shake": "^"}[plan.selections["skill"]], returns.to_rgba(plan.value)
-        marker, colour = ("x", "grey") if plan.status.startswith("exploring") else (marker, colour)
-        axes.scatter(at, j, marker=marker, s=120, color=colour)
+    seen = [PouringWorld(materials[j], float(at), target, receiver_x=0.8).reset(0) for j, at in situations]
+    states = [{label: one[label] for label in loop.graph.states() if label in one} for one in seen]
+    table = sg.solve_many(loop.objectives["start"], states, OPTIMIZER, processes=1)
+    figure = sg.plot_map(table, "mouth", [j for j, _ in situations])
+    figure.set_size_inches(8, 1.8 + 0.5 * len(materials))
+    axes = figure.axes[0]
     met = [visit.observed for visit in loop.store.visits(node="start")]
-    rows = [materials.index(nearest(seen["material"], materials)) - 0.3 for seen in met]
-    axes.scatter([seen["mouth"] for seen in met], rows, s=4, color="black")
-    axes.set(xlabel="mouth", yticks=range(len(materials)), yticklabels=materials, ylim=(-0.5, len(materials) - 0.5))
-    axes.set_title(f"Planned skill for an amount of {target:g}: ○ tip, △ shake; dots: episodes", fontsize="medium")
-    figure.colorbar(returns, ax=axes, label="expected return", extend="min")
+    rows = [materials.index(nearest(one["material"], materials)) - 0.3 for one in met]
+    axes.scatter([one["mouth"] for one in met], rows, s=4, color="black")
+    axes.set(yticks=range(len(materials)), yticklabels=materials, ylim=(-0.5, len(materials) - 0.5))
+    axes.set_title(f"Planned for an amount of {target:g}; dots: episodes", fontsize="medium")
     figure.savefig(path, dpi=150)
 
 
@@ -218,7 +215,7 @@ def pour(folder, options):
             learn(loop, progress)
             draw_curve(loop, curve)
             shown = prove(loop, world, progress)
-            draw_map(loop, setup, options.get("target", 0.3), skill_map, progress)
+            draw_map(loop, setup, options.get("target", 0.3), skill_map)
             if shown:
                 films = [world.film(attempt) for attempt in progress.track(shown, description="filming")]
                 write_video(film, list(itertools.chain(*films)), fps=8)

@@ -138,6 +138,11 @@ class OnlineLoop:
             "seed": self._planning.seed,
         }
 
+    @property
+    def objectives(self) -> dict[str, Objective]:
+        """{node: objective} of the nodes where decisions are made, with what has been learned so far."""
+        return dict(self._planning.objectives)
+
     def __iter__(self) -> Iterator[EpisodeReport]:
         """Run the episodes that are still to come, with a report after each."""
         while (number := self._next()) < self.episodes:
