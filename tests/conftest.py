@@ -13,10 +13,12 @@ REQUIRED_TOOLS = {"C compiler": (("cc", "gcc", "clang"), "apt-get install gcc li
 
 # Packages that only some tests import, and the extra of pyproject.toml that brings each.
 OPTIONAL_PACKAGES = {
+    "distributed": "dev",
     "gymnasium": "sims",
     "imageio": "sims",
     "matplotlib": "plots",
     "mujoco": "sims",
+    "pandas": "dev",
     "pyarrow": "learned",
     "safetensors": "learned",
     "scoringrules": "learned",

@@ -9,9 +9,11 @@ import sys
 import time
 from pathlib import Path
 
+import distributed
 import joblib
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 import pytest
 from small_tasks import refuses
 
@@ -92,7 +94,6 @@ def test_two_processes_find_the_same(objective):
 
 
 def test_a_dask_cluster_finds_the_same(objective):
-    distributed = pytest.importorskip("distributed")
     states = states_of(12)
     with (
         distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
@@ -240,9 +241,8 @@ def test_columns_hold_every_element_and_deviations(objective):
 
 
 def test_pandas_takes_the_columns(objective):
-    pandas = pytest.importorskip("pandas")
     table = sg.solve_many(objective, states_of(4), QUICK, processes=1)
-    frame = pandas.DataFrame(table.columns)
+    frame = pd.DataFrame(table.columns)
     assert frame.shape == (4, 9)
     assert set(frame[frame.x > 2.2].arm) == {"strong"}
 
