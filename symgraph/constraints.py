@@ -12,11 +12,12 @@ Source: Rockafellar, The multiplier method of Hestenes and Powell applied to con
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
 
 from symgraph.requirement import Requirement, Side
 from symgraph.slots import Array
@@ -27,12 +28,26 @@ UNUSED = -1e300  # margin of an inequality on a branch that is not chosen; infin
 
 @dataclass(frozen=True)
 class Constraint:
-    """A side of a requirement at a tree node."""
+    """A side of a requirement at a tree node.
+
+    Attributes:
+        node: index of the tree node.
+        requirement: whose side it is.
+        element: of what its model returns.
+        side: "low", "high" or "equal".
+        way: {selection: choice} that lead to the node.
+    """
 
     node: int
     requirement: Requirement
     element: int
     side: Side
+    way: Mapping[str, str]
+
+    @property
+    def bound(self) -> float:
+        """What the element is compared with."""
+        return float((self.requirement.high if self.side == "high" else self.requirement.low)[self.element])
 
     @property
     def is_equality(self) -> bool:
@@ -51,21 +66,35 @@ class Constraint:
 def constraints_of(tree: Tree, root: int = 0) -> tuple[Constraint, ...]:
     """Return the constraints of a subtree in the order of the margins: from the root, one branch after the other."""
     found = []
-    waiting = [root]
+    waiting: list[tuple[int, dict[str, str]]] = [(root, {})]
     while waiting:
-        node = tree.nodes[waiting.pop()]
+        index, way = waiting.pop()
+        node = tree.nodes[index]
         found += [
-            Constraint(node.index, requirement, element, side)
+            Constraint(index, requirement, element, side, way)
             for requirement in node.requirements
             for element, side in requirement.sides
         ]
-        children = [branch.child for group in node.groups for branch in group.branches if branch.child is not None]
+        children = [
+            (
+                branch.child,
+                way if group.group.selection is None else {**way, group.group.selection: branch.branch.label},
+            )
+            for group in node.groups
+            for branch in group.branches
+            if branch.child is not None
+        ]
         waiting += reversed(children)
     return tuple(found)
 
 
+def counting(constraints: Sequence[Constraint], selections: Mapping[str, str]) -> npt.NDArray[np.bool_]:
+    """Return which constraints count (k,) under {label: choice} of all selections."""
+    return np.array([all(selections[label] == c for label, c in one.way.items()) for one in constraints], dtype=bool)
+
+
 def merit(value: ca.MX, margins: ca.MX, multipliers: ca.MX, weights: ca.MX, constraints: Sequence[Constraint]) -> ca.MX:
-    """Return the augmented Lagrangian; a constraint of weight 0 and multiplier 0 has no part in it.
+    """Return the augmented Lagrangian; a constraint of weight 0 has no part in it.
 
     Args:
         value: J.
@@ -77,8 +106,8 @@ def merit(value: ca.MX, margins: ca.MX, multipliers: ca.MX, weights: ca.MX, cons
     pulled = multipliers + weights * margins
     equality = ca.DM([float(one.is_equality) for one in constraints])
     pulled = ca.if_else(equality, pulled, ca.fmax(pulled, 0.0))
-    halves = ca.if_else(weights > 0.0, 0.5 / weights, 0.0)
-    return value - ca.dot(pulled**2 - multipliers**2, halves)
+    penalties = ca.if_else(weights > 0.0, (pulled**2 - multipliers**2) / (2.0 * weights), 0.0)
+    return value - ca.sum1(penalties)
 
 
 def violations(margins: Array, constraints: Sequence[Constraint]) -> Array:

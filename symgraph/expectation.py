@@ -26,7 +26,7 @@ import casadi as ca
 from symgraph.binding import REQUIREMENT, REWARD, BoundModel
 from symgraph.constraints import Constraint, constraints_of, merit
 from symgraph.model import Parameter
-from symgraph.requirement import SMALLEST_VARIANCE
+from symgraph.requirement import deviation
 from symgraph.slots import Gaussian, State
 from symgraph.structure import Structure, is_open
 from symgraph.tree import Tree, TreeBranch, TreeGroup
@@ -112,7 +112,7 @@ class Expectation:
         penalised = merit(self.value, self.margins, multipliers, weights, self.constraints)
         return self._with_gradient(penalised, [*self.inputs.symbols, multipliers, weights])
 
-    def missed(self) -> ca.Function:
+    def margins_function(self) -> ca.Function:
         """Return the function inputs → margins (k, 1)."""
         return ca.Function("margins", self.inputs.symbols, [ca.densify(self.margins)])
 
@@ -170,7 +170,7 @@ class _Writer:
         worth, instructions = self._worth(0, self._inputs.root)
         value = worth.value
         if self._risk:
-            value = value - self._risk * ca.sqrt(ca.fmax(worth.variance, SMALLEST_VARIANCE))
+            value = value - self._risk * deviation(worth.variance)
         margins = ca.vertcat(*worth.margins) if worth.margins else ca.MX(0, 1)
         constraints = constraints_of(self._tree)
         return Expectation(self._inputs, ca.densify(value), margins, constraints, instructions <= FLATTEN_LIMIT)

@@ -39,6 +39,8 @@ def lacking_models(tree: Tree, allowed: Mapping[str, tuple[int, ...]]) -> dict[B
         if node.index not in ways:
             continue
         here = ways[node.index]
+        for requirement in node.requirements:
+            note(requirement.model, here)
         for group in node.groups:
             probability = group.group.probability
             note(probability if isinstance(probability, BoundModel) else None, here)
@@ -60,7 +62,8 @@ def explore(problem: Problem, selections: list[str], lacking: Mapping[BoundModel
     """Draw actions and choices at random, with the choices that lead to a model that lacks samples.
 
     A choice of the guesses is kept where it leads to one. The value, which such a model has a part in, need not be
-    finite: otherwise the model might never get a sample.
+    finite: otherwise the model might never get a sample. Of some draws, the one that misses requirements least is
+    taken; those that such a model has a part in are only guessed at.
 
     Source: Yamaguchi & Atkeson, Humanoids 2016, section VII-A: if no model is available, the actions are random.
     """
@@ -74,22 +77,33 @@ def explore(problem: Problem, selections: list[str], lacking: Mapping[BoundModel
     status = f"exploring: {', '.join(needs)}"
     # Another draw with every sample that has come in, so that a loop that leaves the seed alone tries various actions.
     rng = np.random.default_rng([seed, zlib.crc32(status.encode())])
+    best: Run | None = None
     for _ in range(MOST_DRAWS):
         choices = problem.draw_choices(rng, 1, evenly=False)
         for label, choice in ways[rng.integers(len(ways))].items():
             choices[0, selections.index(label)] = choice
         points = problem.draw_points(rng, 1, "uniform")
         value = float(problem.values(points, choices)[0])
-        if np.isfinite(value):
+        run = problem.judge(Run(points[0], points[0], choices[0], value, "drawn", np.array([value])))
+        if best is None or _rank(run) > _rank(best):
+            best = run
+        if np.isfinite(run.value) and run.meets:
             break
-    run = Run(points[0], points[0], choices[0], value if np.isfinite(value) else np.nan, "drawn", np.array([value]))
-    return Search([run], status)
+    best = best or run
+    best.value = best.value if np.isfinite(best.value) else np.nan
+    return Search([best], status)
+
+
+def _rank(run: Run) -> tuple[bool, bool, float]:
+    return bool(np.isfinite(run.value)), run.meets, -run.missed
 
 
 def met(nodes: NodeOutcomes, lacking: Mapping[BoundModel, Decisions]) -> bool:
     """Whether a plan meets one of the models with a probability that is worth trying."""
     for node in nodes.tree.nodes:
         here = nodes.probabilities[node.index]
+        if here >= SELDOM and any(requirement.model in lacking for requirement in node.requirements):
+            return True
         for group in node.groups:
             if group.group.probability in lacking and here >= SELDOM:
                 return True

@@ -189,7 +189,7 @@ def _digest(objective: Objective, situations: list[Situation], options: Options)
     parts = [repr((objective.risk, options)).encode()]
     if situations:
         build = situations[0].build
-        parts.append(build.kernel_function.serialize().encode())
+        parts.append(build.function.serialize().encode())
         parts += [parameter.value.tobytes() for parameter in build.expectation.inputs.parameters]
     return hashlib.sha256(b"\0".join(parts)).hexdigest()
 

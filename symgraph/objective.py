@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -31,6 +32,7 @@ class Build:
         self._compiled = compiled
         self._risk = risk
         self.kept: dict[Any, Any] = {}  # what optimizers derive from the expression and use again
+        self.lock = threading.Lock()  # of what is kept
 
     @cached_property
     def expectation(self) -> Expectation:
@@ -59,17 +61,17 @@ class Build:
     @cached_property
     def margins(self) -> FlatFunction:
         """inputs → by how much constraints are missed (k, 1), in CasADi's interpreter."""
-        return FlatFunction(self.expectation.missed())
-
-    @cached_property
-    def kernel_function(self) -> ca.Function:
-        """What searches climb: J and its gradient, of the merit if there are constraints."""
-        return self.expectation.merit_and_gradient() if self.expectation.constraints else self.function
+        return FlatFunction(self.expectation.margins_function())
 
     @cached_property
     def kernel(self) -> Kernel:
-        """`kernel_function` at many points, compiled where that is possible."""
-        return make_kernel(self.kernel_function, self._compiled)
+        """J and its gradient at many points, compiled where that is possible."""
+        return make_kernel(self.function, self._compiled)
+
+    @cached_property
+    def merit_kernel(self) -> Kernel:
+        """Likewise of the augmented Lagrangian, by which constraints are kept."""
+        return make_kernel(self.expectation.merit_and_gradient(), self._compiled)
 
     @property
     def has_kernel(self) -> bool:
@@ -91,26 +93,15 @@ class Situation:
         parameters = self.build.expectation.inputs.parameters
         return [self.means, self.covariances, *(p.value.ravel(order="F") for p in parameters)]
 
-    def bind(
-        self,
-        low: Array,
-        high: Array,
-        multipliers: Array | None = None,
-        weights: Array | None = None,
-        stop: Stop = NEVER,
-    ) -> BoundKernel:
-        """Return the kernel at this state.
+    def bind(self, low: Array, high: Array, stop: Stop = NEVER) -> BoundKernel:
+        """Return the kernel of J at this state, for actions between bounds (n,); a stop ends searches early."""
+        return self.build.kernel.bind(self.shared, low, high, stop)
 
-        Args:
-            low: (n,) bounds of the actions.
-            high: likewise.
-            multipliers: (k,) of the constraints, 0 if left out: with weights of 0 they have no part in the value.
-            weights: (k,) likewise.
-            stop: ends searches early.
-        """
-        nothing = np.zeros(len(self.build.expectation.constraints))
-        pulls = [nothing if given is None else given for given in (multipliers, weights)] if nothing.size else []
-        return self.build.kernel.bind([*self.shared, *pulls], low, high, stop)
+    def bind_merit(
+        self, low: Array, high: Array, multipliers: Array, weights: Array, stop: Stop = NEVER
+    ) -> BoundKernel:
+        """Return the kernel of the augmented Lagrangian, with multipliers and weights (k,) of the constraints."""
+        return self.build.merit_kernel.bind([*self.shared, multipliers, weights], low, high, stop)
 
 
 class Objective:
@@ -150,7 +141,7 @@ class Objective:
         actions: Mapping[str, Any] | None = None,
         selections: Mapping[str, str] | None = None,
     ) -> float:
-        """Return the expected sum of rewards.
+        """Return the expected sum of rewards, less what the risk takes away.
 
         Args:
             state: label → number, array or Gaussian [unit], at least the states that some path reads before writing.
@@ -190,10 +181,10 @@ class Objective:
     ) -> float:
         """Return the largest breach of a requirement in the unit of its model, 0 if all are met; see `value`."""
         situation = self.situation(state)
-        missed = self.missed(situation, self.stack_actions(actions), self.one_hot(selections))
-        return float(missed.max(initial=0.0))
+        breaches = self.breaches(situation, self.stack_actions(actions), self.one_hot(selections))
+        return float(breaches.max(initial=0.0))
 
-    def missed(self, situation: Situation, actions: Array, hot: Array) -> Array:
+    def breaches(self, situation: Situation, actions: Array, hot: Array) -> Array:
         """Return by how much each constraint is missed (k,), each at least 0, at stacked actions and selections."""
         (margins,) = situation.build.margins([actions, hot, *situation.shared])
         return violations(margins, situation.build.expectation.constraints)

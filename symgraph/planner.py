@@ -12,14 +12,14 @@ import numpy as np
 
 from symgraph.binding import BoundModel
 from symgraph.compile.kernel import Stop
+from symgraph.constraints import counting
 from symgraph.errors import InputError, SolveError, did_you_mean, names
 from symgraph.exploration import Decisions, explore, lacking_models, met
 from symgraph.objective import Objective, Situation, check_choice, checked_column, stacked_index
-from symgraph.optimizers.constrained import MET, Constrained
+from symgraph.optimizers.constrained import ROUNDING, Constrained
 from symgraph.optimizers.lbfgs import Lbfgs
 from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
 from symgraph.optimizers.settings import number
-from symgraph.optimizers.starts import status_of
 from symgraph.plan import Plan, PlanRun
 from symgraph.progress import Progress
 from symgraph.slots import Action, Array, Choices, Selection, State
@@ -93,23 +93,24 @@ def solve(
         raise SolveError(_why_not_finite(objective, situation, search))
     chosen = _names(objective, best.choices)
     nodes = objective.outcomes_of(situation, best.point, chosen)
-    missed = objective.missed(situation, best.point, objective.one_hot(chosen))
+    breaches = objective.breaches(situation, best.point, objective.one_hot(chosen))
     status = search.status
     if search.interrupted:
         status = f"interrupted: best of {len(search.runs)} runs"
     elif stop:
-        status = f"time limit: {status_of(problem, search.runs, len(search.runs))}"
-    if best.missed > MET:
-        status = f"requirements are missed: {_told(objective, situation, missed)[0]}; {status}"
+        status = f"time limit: {status}"
+    missed = [] if best.meets else _told(objective, problem, best, breaches)
+    if missed:
+        status = f"requirements are missed: {missed[0]}; {status}"
     planned_or_seen: dict[str, Action | State] = {**objective.graph.actions(), **objective.graph.states()}
     return Plan(
         actions=objective.unstack(best.point),
         selections=chosen,
         value=best.value,
-        violation=float(missed.max(initial=0.0)),
+        violation=float(breaches.max(initial=0.0)),
         status=status,
         notes=(
-            *(_told(objective, situation, missed)[1:MOST_TOLD] if best.missed > MET else ()),
+            *missed[1:MOST_TOLD],
             *_held_outside(objective, fixed or {}),
             *nodes.notes(),
             *([] if explores else _seldom(lacking)),
@@ -126,7 +127,7 @@ def solve(
 @contextmanager
 def _set_in_time(stop: Stop) -> Iterator[None]:
     """Set a stop after its seconds while something goes on."""
-    timer = threading.Timer(float(stop.seconds or 0.0), stop.set)
+    timer = threading.Timer(min(float(stop.seconds or 0.0), threading.TIMEOUT_MAX), stop.set)
     if stop.seconds is not None:
         timer.start()
     try:
@@ -135,11 +136,14 @@ def _set_in_time(stop: Stop) -> Iterator[None]:
         timer.cancel()
 
 
-def _told(objective: Objective, situation: Situation, missed: Array) -> list[str]:
+def _told(objective: Objective, problem: Problem, run: Run, breaches: Array) -> list[str]:
     """Say which constraints are missed and by how much, the worst first."""
-    constraints = situation.build.expectation.constraints
-    worst = [k for k in np.argsort(-missed) if missed[k] > 0.0]
-    return [f"{constraints[k].told(objective.tree)} by {missed[k]:.3g}" for k in worst]
+    if problem.constrained is None:
+        return []
+    constraints = problem.situation.build.expectation.constraints
+    shares = breaches / problem.constrained.units(run.choices)
+    worst = [k for k in np.argsort(-shares) if not shares[k] <= ROUNDING]
+    return [f"{constraints[k].told(objective.tree)} by {breaches[k]:.3g}" for k in worst]
 
 
 def _explored(
@@ -183,9 +187,8 @@ def _problem(
         else:
             check_choice(label, value, slot)
             allowed[label] = (slot.choices.index(value),)
-    constraints = situation.build.expectation.constraints
     return Problem(
-        kernel=situation.bind(low, high, stop=stop),
+        kernel=situation.bind(low, high, stop),
         situation=situation,
         low=low,
         high=high,
@@ -194,14 +197,22 @@ def _problem(
         cut=lambda choices: objective.chosen(_names(objective, choices)).situation(situation.given),
         guesses=tuple(_guess(objective, one, allowed) for one in _listed(guess)),
         progress=progress,
-        constrained=Constrained(
-            constraints,
-            lambda actions, hot: situation.build.margins([actions, hot, *situation.shared])[0],
-            lambda multipliers, weights: situation.bind(low, high, multipliers, weights, stop),
-        )
-        if constraints
-        else None,
+        constrained=_constrained(objective, situation, low, high, stop),
         stop=stop,
+    )
+
+
+def _constrained(objective: Objective, situation: Situation, low: Array, high: Array, stop: Stop) -> Constrained | None:
+    constraints = situation.build.expectation.constraints
+    if not constraints:
+        return None
+    return Constrained(
+        constraints,
+        low,
+        high,
+        lambda choices: counting(constraints, _names(objective, choices)),
+        lambda actions, hot: situation.build.margins([actions, hot, *situation.shared])[0],
+        lambda multipliers, weights: situation.bind_merit(low, high, multipliers, weights, stop),
     )
 
 
@@ -280,6 +291,11 @@ def _why_not_finite(objective: Objective, situation: Situation, search: Search) 
                 return f"no start point has a finite value: {label!r} is {gaussian} on the path {node.path!r} {at}"
         if not np.isfinite(node.reward):
             return f"no start point has a finite value: the reward is {node.reward} on the path {node.path!r} {at}"
+    constraints = situation.build.expectation.constraints
+    breaches = objective.breaches(situation, run.start, objective.one_hot(selections)) if constraints else np.zeros(0)
+    for constraint, breach in zip(constraints, breaches, strict=True):
+        if not np.isfinite(breach):
+            return f"no start point can be judged: the requirement {constraint.told(objective.tree)} is {breach} {at}"
     return f"no start point has a finite value or gradient, e.g. {at}; look for square roots and divisions at 0"
 
 

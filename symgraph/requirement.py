@@ -58,7 +58,7 @@ class Requirement:
         spread = None
         if self.confidence is not None and outcome.covariance.nnz():
             variance = ca.diag(outcome.covariance)
-            spread = NormalDist().inv_cdf(self.confidence) * ca.sqrt(ca.fmax(variance, SMALLEST_VARIANCE))
+            spread = NormalDist().inv_cdf(self.confidence) * deviation(variance)
         margins = []
         for i, side in self.sides:
             mean = outcome.mean[i]
@@ -78,6 +78,11 @@ class Requirement:
         bound = (self.high if side == "high" else self.low)[element]
         sure = "" if self.confidence is None else f" with probability {self.confidence:g}"
         return f"{name} {sign} {bound:g}{sure}"
+
+
+def deviation(variance: ca.MX) -> ca.MX:
+    """Return √variance with finite slopes at 0; NaN stays NaN."""
+    return ca.sqrt(ca.if_else(variance <= SMALLEST_VARIANCE, SMALLEST_VARIANCE, variance))
 
 
 def requirement(model: BoundModel, low: Any, high: Any, confidence: Any, place: str) -> Requirement:

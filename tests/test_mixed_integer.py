@@ -29,7 +29,7 @@ def test_every_combination_is_tried():
     plan = sg.solve(objective_of(known.graph()), {}, sg.Enumerate(sg.Lbfgs(starts=2)))
     tried = {tuple(run.selections.values()) for run in plan.runs}
     assert len(tried) == 8
-    assert plan.status == "best of 16 starts"
+    assert plan.status == "enumerated 8 combinations of selections: best of 16 starts"
     held = sg.solve(objective_of(known.graph()), {}, sg.Enumerate(), fixed={"y1": "no"})
     assert {run.selections["y1"] for run in held.runs} == {"no"}
 

@@ -149,12 +149,11 @@ class Adadelta(Optimizer):
                     problem.progress.update(max(spent / total, len(finished) / wanted), 1.0)
         except KeyboardInterrupt:
             interrupted = True
+        polished: list[Run] = []
         if self.polish and not interrupted and not problem.stop:
             polished, interrupted = self._polished(problem, ended)
-            ended = [*map(problem.judge, ended), *polished]
-        else:
-            ended = [*map(problem.judge, ended)]
-        status = status_of(problem, ended, len({run.start.tobytes() + run.choices.tobytes() for run in ended}))
+        ended = [*map(problem.judge, ended), *polished]
+        status = status_of(problem, ended)
         if deaths > MAX_DEATHS:
             status = f"best of {len(ended)} runs: given up, because worker processes died again and again"
         return Search(ended, status, interrupted)
@@ -200,7 +199,7 @@ class _Queue:
             guessed, guessed_choices = problem.started_from_guesses(rng)
             points, choices = np.concatenate([guessed, points]), np.concatenate([guessed_choices, choices])
         self.starts = len(points)
-        values = problem.merits(points, choices, problem.values(points, choices))
+        values, _ = problem.merits(points, choices, problem.values(points, choices))
         self._in_turn = not settings.requeue
         self.waiting = [
             Run(point, point, choice, float(value), "iteration limit", np.zeros(0))

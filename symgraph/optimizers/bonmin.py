@@ -19,6 +19,8 @@ from symgraph.optimizers.starts import promising_points
 from symgraph.slots import Array, Choices
 
 NO_LIMIT = 1e9  # [s]
+BAND = 1e-7  # of a constraint's unit, in which an equation holds until actions are refined
+WHOLE = 1e-4  # of an element of a one-hot column: so far from 0 or 1 it is neither
 
 
 @dataclass(frozen=True)
@@ -60,58 +62,76 @@ class Bonmin(Optimizer):
         else:
             groups = min(self.samples, problem.combinations)
             points, choices = promising_points(problem, rng, groups, max(1, self.samples // groups))
-        best = int(np.argmax(problem.merits(points, choices, problem.values(points, choices))))
+        best = problem.most_promising(points, choices)
         point, choice = points[best], choices[best]
         problem.progress.wait("planning")
         hot = problem.one_hot(choice[None])[0]
-        found, status = self._searched(problem, np.concatenate([point, hot]), problem.scale(choice))
-        if status == "SUCCESS":
-            point, choice = found[: problem.n], _choices(found[problem.n :], problem.sizes)
+        units = np.zeros(0) if problem.constrained is None else problem.constrained.typical(choice)
+        with problem.situation.build.lock:  # CasADi's solver is one for all threads
+            start = np.concatenate([point, hot])
+            found, status = self._searched(problem, start, np.concatenate([units, [problem.scale(choice)]]))
+        reached = self._reached(problem, found)
+        if reached is not None:  # whatever ended it: the best so far may be better than the start
+            pair = np.array([point, reached[0]]), np.array([choice, reached[1]])
+            if status == "SUCCESS" or problem.most_promising(*pair) == 1:
+                point, choice = reached
         held = tuple((int(one),) for one in choice)
         refined = refine.run(replace(problem, allowed=held, guesses=((point, choice),)), rng)
         for run in refined.runs:
             run.start = points[best]
-        how = {"SUCCESS": "branch and bound ended"}.get(status, f"branch and bound failed ({status})")
-        return Search(refined.runs, f"{how}; {refined.status}", refined.interrupted)
+        how = {"SUCCESS": "branch and bound ended", "LIMIT_EXCEEDED": "branch and bound ran out of time"}
+        told = how.get(status, f"branch and bound failed ({status})")
+        interrupted = refined.interrupted or status == "USER_INTERRUPT"
+        return Search(refined.runs, f"{told}; {refined.status}", interrupted)
 
-    def _searched(self, problem: Problem, start: Array, scale: float) -> tuple[Array, str]:
+    @staticmethod
+    def _reached(problem: Problem, found: Array) -> tuple[Array, Choices] | None:
+        """Return actions and choices of what branch and bound returned, None if selections are not whole numbers."""
+        point, hot = np.clip(found[: problem.n], problem.low, problem.high), found[problem.n :]
+        if not np.isfinite(found).all() or np.abs(hot - np.round(hot)).max(initial=0.0) > WHOLE:
+            return None
+        return point, _choices(hot, problem.sizes)
+
+    def _searched(self, problem: Problem, start: Array, scales: Array) -> tuple[Array, str]:
         """Return where branch and bound ended, actions and one-hot selections, and its status."""
         situation = problem.situation
         solver = self._solver(situation.build, problem)
         allowed = np.concatenate([np.isin(range(n), a) for n, a in zip(problem.sizes, problem.allowed, strict=True)])
         low = np.concatenate([problem.low, np.zeros(len(allowed))])
         high = np.concatenate([problem.high, allowed.astype(float)])
-        least = [0.0 if one.is_equality else -np.inf for one in situation.build.relaxed.constraints]
-        quiet = contextlib.redirect_stdout(io.StringIO())  # some of its messages no option turns off
+        # Equations as narrow bands: with selections held there may be fewer unknowns than equations, which IPOPT refuses.
+        bands = [BAND if one.is_equality else np.inf for one in situation.build.relaxed.constraints]
+        # Some of its messages no option turns off. What other threads print meanwhile is lost with them.
+        quiet = contextlib.redirect_stdout(io.StringIO())
         try:
             with quiet:
                 result = solver(
                     x0=start,
                     lbx=low,
                     ubx=high,
-                    lbg=[*least, *np.ones(len(problem.sizes))],
-                    ubg=[*np.zeros(len(least)), *np.ones(len(problem.sizes))],
-                    p=np.concatenate([*situation.shared, [scale]]),
+                    lbg=[*(-band for band in bands), *np.ones(len(problem.sizes))],
+                    ubg=[*(0.0 if np.isinf(band) else band for band in bands), *np.ones(len(problem.sizes))],
+                    p=np.concatenate([*situation.shared, scales]),
                 )
         except RuntimeError:  # what its branches raise, it does not catch
             return start, "a branch could not be evaluated"
         return np.array(result["x"]).ravel(), str(solver.stats()["return_status"])
 
     def _solver(self, build: Build, problem: Problem) -> ca.Function:
-        """Return BONMIN on −J/scale over actions and one-hot selections, for the other inputs and the scale."""
+        """Return BONMIN on −J/scale over actions and one-hot selections, for the other inputs and the scales."""
         limit = NO_LIMIT if problem.stop.seconds is None else problem.stop.seconds
-        key = self, limit
-        if key not in build.kept:
+        kept_limit, kept = build.kept.get(self, (None, None))
+        if kept_limit != limit:  # an option that it takes when it is built
             expectation = build.relaxed
             actions, selections, *others = expectation.inputs.symbols
-            scale = ca.MX.sym("scale")
+            scale, units = ca.MX.sym("scale"), ca.MX.sym("units", len(expectation.constraints))
             ends = np.cumsum([0, *problem.sizes])
             sums = [ca.sum1(selections[a:b]) for a, b in itertools.pairwise(ends)]
             nlp: Any = {
                 "x": ca.vertcat(actions, selections),
-                "p": ca.veccat(*others, scale),
+                "p": ca.veccat(*others, units, scale),
                 "f": -expectation.value / scale,
-                "g": ca.vertcat(expectation.margins, *sums),
+                "g": ca.vertcat(expectation.margins / units, *sums),
             }
             kinds = "bb_log_level", "nlp_log_level", "nlp_log_at_root", "milp_log_level", "lp_log_level", "print_level"
             quiet = dict.fromkeys(kinds, 0)
@@ -128,8 +148,9 @@ class Bonmin(Optimizer):
                     "time_limit": limit,
                 },
             }
-            build.kept[key] = ca.nlpsol("bonmin", "bonmin", nlp, options)
-        solver: ca.Function = build.kept[key]
+            kept = ca.nlpsol("bonmin", "bonmin", nlp, options)
+            build.kept[self] = limit, kept
+        solver: ca.Function = kept
         return solver
 
 

@@ -1,4 +1,4 @@
-"""Search under constraints: the method of multipliers around a search without them.
+"""Search under constraints: the method of multipliers around a search without them, and what counts as meeting all.
 
 One climb after the other maximises the augmented Lagrangian of `symgraph.constraints`; between two, multipliers follow
 what is missed, and weights grow where that does not fall.
@@ -11,17 +11,19 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from symgraph.compile.kernel import BoundKernel, Ended
-from symgraph.constraints import UNUSED, Constraint, violations
+from symgraph.constraints import Constraint, violations
 from symgraph.slots import Array, Choices
 
-MET = 1e-6  # what may be missed of a requirement, in units of how much its margin varies over the bounds
-CLOSE = 1e-10  # as MET, what a search goes on to
+MOVE = 1e-6  # of an action's range: what such moves would make up for counts as rounding
+ROUNDING = 1e-9  # of a constraint's unit, likewise: where margins are flat, moves make up for nothing
+CLOSE = 1e-10  # of a constraint's unit: what a search goes on to
 FIRST_WEIGHT = 1000.0  # less lets a climb leave for where nothing leads back to what is required
 GROWTH = 10.0  # of weights
+MOST_GROWTH = 1e9
 ENOUGH = 0.25  # of what was missed before: while that much less is missed each time, weights stay
-LARGEST_WEIGHT = 1e12
 ROUNDS = 40
 FIRST_TOLERANCE = 1e-2  # of a climb; the multipliers are not right yet
 
@@ -29,8 +31,14 @@ FIRST_TOLERANCE = 1e-2  # of a climb; the multipliers are not right yet
 class Constrained:
     """The constraints of a problem at its start state.
 
+    Each has a unit for each combination of selections, a typical size of its margin over the bounds, so that it does
+    not matter in what unit a model computes.
+
     Args:
         constraints: k of them.
+        low: (n,) bounds of the actions.
+        high: likewise.
+        counts: choices (s,) → which constraints count (k,).
         margins: actions (n,) and one-hot selections (m,) → margins (k,).
         bind: multipliers (k,) and weights (k,) → the kernel of the augmented Lagrangian.
     """
@@ -38,50 +46,93 @@ class Constrained:
     def __init__(
         self,
         constraints: Sequence[Constraint],
+        low: Array,
+        high: Array,
+        counts: Callable[[Choices], npt.NDArray[np.bool_]],
         margins: Callable[[Array, Array], Array],
         bind: Callable[[Array, Array], BoundKernel],
     ) -> None:
         self._constraints = constraints
+        self._moves = np.diag(MOVE * (high - low))
+        self._middle = (low + high) / 2
+        self._counts = counts
         self._margins = margins
         self._bind = bind
         self._equality = np.array([one.is_equality for one in constraints], dtype=bool)
-        self._spreads: dict[bytes, Array] = {}
+        self._bounds = np.array([abs(one.bound) for one in constraints])
+        self._units: dict[bytes, Array] = {}
+
+    @property
+    def count(self) -> int:
+        """k."""
+        return len(self._constraints)
 
     def margins(self, points: Array, hot: Array) -> Array:
         """Return the margins (P, k) at points (P, n) under one-hot selections (P, m)."""
         return np.array([self._margins(point, chosen) for point, chosen in zip(points, hot, strict=True)])
 
-    def learn_spread(self, choice: Choices, margins: Array) -> None:
-        """Take from samples (P, k) how much margins vary under choices (s,)."""
-        finite = np.where(np.isfinite(margins), margins, np.nan)
-        used = ~(margins == UNUSED).all(axis=0)
+    def learn(self, choice: Choices, margins: Array) -> None:
+        """Take the units under choices (s,) from margins at samples (P, k)."""
+        sizes = np.sort(np.where(np.isfinite(margins), np.abs(margins), np.inf), axis=0)
+        quarter = sizes[len(sizes) // 4]
         with np.errstate(invalid="ignore"):
-            low, high = np.nanmin(finite, axis=0, initial=np.inf), np.nanmax(finite, axis=0, initial=-np.inf)
-        spread = np.where(used & (high > low), high - low, 1.0)
-        self._spreads[choice.tobytes()] = np.where(used, spread, np.inf)  # what has no part in it weighs nothing
+            spread = np.where(np.isfinite(margins), margins, np.nan)
+            ranges = np.nan_to_num(np.nanmax(spread, 0, initial=-np.inf) - np.nanmin(spread, 0, initial=np.inf))
+        # A quarter of all margins are no larger: a few steep ones say nothing of those near 0. Nor does an offset.
+        found = np.where((quarter > 0.0) & (quarter < ranges), quarter, ranges)
+        units = np.where((found > 0.0) & np.isfinite(found), found, np.maximum(self._bounds, 1.0))
+        self._units[choice.tobytes()] = np.where(self._counts(choice), units, np.inf)
 
     def knows(self, choice: Choices) -> bool:
-        """Whether `learn_spread` was called for choices."""
-        return choice.tobytes() in self._spreads
+        """Whether `learn` was called for choices."""
+        return choice.tobytes() in self._units
 
-    def missed(self, margins: Array, choice: Choices) -> Array:
-        """Return the largest share (…,) of their spreads by which constraints are missed, from margins (…, k)."""
-        return np.asarray((violations(margins, self._constraints) / self._spreads[choice.tobytes()]).max(axis=-1))
+    def units(self, choice: Choices) -> Array:
+        """Return the units (k,) under choices, infinite for what does not count."""
+        return self._units[choice.tobytes()]
+
+    def typical(self, choice: Choices) -> Array:
+        """Return the units (k,) under choices, of what does not count the size of its bound."""
+        units = self.units(choice)
+        return np.where(np.isfinite(units), units, np.maximum(self._bounds, 1.0))
+
+    def share(self, margins: Array, choice: Choices) -> Array:
+        """Return the largest breach (…,) in units of the constraints, from margins (…, k)."""
+        return np.asarray((violations(margins, self._constraints) / self.units(choice)).max(axis=-1))
+
+    def meets(self, point: Array, choice: Choices, hot: Array) -> bool:
+        """Whether a point (n,) meets all that counts, but for rounding."""
+        margins = self._margins(point, hot)
+        counts = self._counts(choice)
+        breaches = np.where(counts, violations(margins, self._constraints), 0.0)
+        if not breaches.any():
+            return True
+        slack = np.zeros(self.count)
+        inward = np.where(point > self._middle, -1.0, 1.0)
+        for move in inward * self._moves:
+            change = np.abs(self._margins(point + move, hot) - margins)
+            slack += np.where(np.isfinite(change), change, 0.0)
+        typical = np.where(np.isfinite(self.units(choice)), self.units(choice), 0.0) if point.size else self._bounds
+        return bool((breaches <= slack + ROUNDING * typical).all())  # NaN meets nothing
 
     def penalty(self, margins: Array, choice: Choices, scale: float) -> Array:
         """Return what `penalised` takes away (…,) at margins (…, k)."""
         weights = self._weights(choice, scale)
-        return np.asarray((weights / 2 * violations(margins, self._constraints) ** 2).sum(axis=-1))
+        with np.errstate(invalid="ignore"):
+            terms = np.where(weights > 0.0, weights / 2 * violations(margins, self._constraints) ** 2, 0.0)
+        return np.asarray(terms.sum(axis=-1))
 
     def penalised(self, choice: Choices, scale: float) -> BoundKernel:
-        """Return the kernel of J minus penalties, w/2 · missed²; the scale is that of J [reward]."""
+        """Return the kernel of J minus penalties, w/2 · breach²; the scale is that of J [reward]."""
         weights = self._weights(choice, scale)
         return self._bind(np.zeros_like(weights), weights)
 
     def climb(
         self, start: Array, choice: Choices, hot: Array, iterations: int, tolerance: float, scale: float
-    ) -> tuple[Ended, float]:
-        """Climb from one point to a local maximum that meets all constraints, or misses them least.
+    ) -> Ended:
+        """Climb from one point to a local maximum that meets all constraints.
+
+        Where none is found, to where least is missed; but a point on the way that meets all is not given up.
 
         Args:
             start: (n,) actions.
@@ -92,35 +143,41 @@ class Constrained:
             scale: of J [reward].
 
         Returns:
-            where it ended, valued by the augmented Lagrangian, and what is missed there, see `missed`.
+            where it ended; its value is that of the augmented Lagrangian.
         """
-        weights, multipliers = self._weights(choice, scale), np.zeros(len(self._constraints))
-        spread = self._spreads[choice.tobytes()]
+        weights, multipliers, growth = self._weights(choice, scale), np.zeros(len(self._constraints)), 1.0
+        units = self.units(choice)
         point, history = start, [np.zeros(0)]
-        before, slack = np.inf, FIRST_TOLERANCE
-        left = iterations
+        kept: tuple[float, Array] | None = None  # J and place of the best that meets all
+        margins = self._margins(start, hot)
+        before, slack, left = np.inf, FIRST_TOLERANCE, iterations
         while True:
             ended = self._bind(multipliers, weights).climb(point, hot, left, max(tolerance, slack) * scale)
+            if len(history) == 1 and self.share(margins, choice) <= CLOSE:
+                kept = float(ended.history[0] + self.penalty(margins, choice, scale)), start
             history.append(ended.history)
             left -= len(ended.history)
             if ended.outcome == "not finite":
-                ended.history = np.concatenate(history)
-                return ended, np.inf
-            point = ended.point
-            margins = self._margins(point, hot)
-            pulled = multipliers + weights * margins
-            # By how much constraints, or the multipliers of those that do not bind, are not yet right.
-            moved = np.where(self._equality, margins, np.maximum(margins, -multipliers / np.maximum(weights, 1e-300)))
-            wrong = float(np.abs(np.where(weights > 0.0, moved / spread, 0.0)).max(initial=0.0))
+                return Ended(point if kept is None else kept[1], 0.0, "not finite", np.concatenate(history))
+            point, margins = ended.point, self._margins(ended.point, hot)
+            pulled = np.where(weights > 0.0, multipliers + weights * margins, 0.0)
+            pulled = np.where(self._equality, pulled, np.maximum(pulled, 0.0))
+            with np.errstate(divide="ignore", invalid="ignore"):
+                taken = np.where(weights > 0.0, (pulled**2 - multipliers**2) / (2 * weights), 0.0).sum()
+                # By how much constraints, or the multipliers of those that do not bind, are not yet right.
+                wrong = float(np.abs(np.where(weights > 0.0, (pulled - multipliers) / weights / units, 0.0)).max())
+            value, share = float(ended.value + taken), float(self.share(margins, choice))
+            if share <= CLOSE and (kept is None or value >= kept[0]):
+                kept = value, point
             settled = slack <= tolerance and wrong <= CLOSE
-            over = left <= 0 or ended.outcome == "time limit"
-            if settled or over or len(history) > ROUNDS or weights.max() > LARGEST_WEIGHT * scale:
-                ended.history = np.concatenate(history)
-                return ended, float(self.missed(margins, choice))
-            multipliers = np.where(self._equality, pulled, np.maximum(pulled, 0.0))
+            over = left <= 0 or ended.outcome == "time limit" or len(history) > ROUNDS or growth > MOST_GROWTH
+            if settled or over:
+                end = point if settled or kept is None else kept[1]
+                return Ended(end, ended.value, ended.outcome, np.concatenate(history))
+            multipliers = pulled
             if wrong > ENOUGH * before and wrong > CLOSE:
-                weights = weights * GROWTH
+                weights, growth = weights * GROWTH, growth * GROWTH
             before, slack = wrong, slack / 10.0
 
     def _weights(self, choice: Choices, scale: float) -> Array:
-        return FIRST_WEIGHT * scale / self._spreads[choice.tobytes()] ** 2
+        return FIRST_WEIGHT * scale / self.units(choice) ** 2

@@ -54,4 +54,6 @@ class Enumerate(Optimizer):
             if search.interrupted:
                 return Search(runs, "", interrupted=True)
             problem.progress.update(code + 1, problem.combinations)
-        return Search(runs, status_of(problem, runs, len(runs)))
+        all_tried = len({run.choices.tobytes() for run in runs}) == problem.combinations
+        head = f"enumerated {problem.combinations} combinations of selections: " if all_tried else ""
+        return Search(runs, f"{head}{status_of(problem, runs)}")

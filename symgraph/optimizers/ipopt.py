@@ -14,13 +14,15 @@ import casadi as ca
 import numpy as np
 
 from symgraph.compile.kernel import NEVER, Outcome, Stop
+from symgraph.expectation import Expectation
 from symgraph.objective import Build
 from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
 from symgraph.optimizers.settings import number, positive_whole
-from symgraph.optimizers.starts import promising_points
+from symgraph.optimizers.starts import climbed, promising_points
 from symgraph.slots import Array, Choices
 
 SMALLEST_TOLERANCE = 1e-15  # IPOPT refuses 0
+SAME_DEPTH = 8  # operations down to which two expressions are compared
 _OUTCOMES: dict[str, Outcome] = {
     "Solve_Succeeded": "converged",
     "Solved_To_Acceptable_Level": "converged",
@@ -60,7 +62,7 @@ class Ipopt(Optimizer):
             # One candidate for each combination of selections.
             groups = min(self.samples, problem.combinations)
             points, choices = promising_points(problem, rng, groups, max(1, self.samples // groups))
-            best = int(np.argmax(problem.merits(points, choices, problem.values(points, choices))))
+            best = problem.most_promising(points, choices)
             points, choices = points[best : best + 1], choices[best : best + 1]
         runs: list[Run] = []
         problem.progress.wait("planning")
@@ -78,62 +80,97 @@ class Ipopt(Optimizer):
         return Search(runs, ended if ended == "converged" else f"not converged: {ended}")
 
     def _from(self, problem: Problem, point: Array, choice: Choices, interrupted: list[int]) -> Run:
-        hot = problem.one_hot(choice[None])
         start_value = float(problem.values(point[None], choice[None])[0])
-        if not np.isfinite(start_value):
-            return Run(point, point, choice, start_value, "not finite", np.array([start_value]))
+        ended: Outcome = "converged" if problem.n == 0 else "stalled"
+        start = problem.judge(Run(point, point, choice, start_value, ended, np.array([start_value])))
         if problem.n == 0:
-            return Run(point, point, choice, start_value, "converged", np.array([start_value]))
-        situation = problem.cut(choice)
-        solver = self._solver(situation.build, interrupted, problem.stop)
-        scale = problem.scale(choice)
-        least = [0.0 if one.is_equality else -np.inf for one in situation.build.expectation.constraints]
-        found = solver(
-            x0=point,
-            lbx=problem.low,
-            ubx=problem.high,
-            lbg=least,
-            ubg=0.0,
-            p=np.concatenate([hot[0], *situation.shared, [scale]]),
-        )
-        statistics = solver.stats()
+            return start
+        if not np.isfinite(start_value):
+            start.outcome = "not finite"
+            return start
+        situation, units = problem.cut(choice), np.zeros(0)
+        if problem.constrained is not None:
+            units = problem.constrained.units(choice)
+            units = units[np.isfinite(units)]  # those of the constraints of the cut tree, in the same order
+        with situation.build.lock:  # CasADi's solver is one for all threads
+            solver = self._solver(situation.build, interrupted, problem.stop)
+            if solver.equalities > np.count_nonzero(problem.low < problem.high):
+                # More equations than unknowns, which IPOPT refuses; they may hold all the same.
+                return climbed(problem, point[None], choice[None], self.iterations, self.tolerance)[0][0]
+            scale = problem.scale(choice)
+            found = solver.function(
+                x0=point,
+                lbx=problem.low,
+                ubx=problem.high,
+                lbg=solver.least,
+                ubg=0.0,
+                p=np.concatenate([problem.one_hot(choice[None])[0], *situation.shared, units, [scale]]),
+            )
+            statistics = solver.function.stats()
         outcome = "time limit" if problem.stop else _OUTCOMES.get(str(statistics["return_status"]), "stalled")
         history = -scale * np.array(statistics.get("iterations", {}).get("obj", [-start_value / scale]))
-        end = np.clip(np.array(found["x"]).ravel(), problem.low, problem.high)
-        runs = [
-            problem.judge(Run(point, at, choice, float(problem.values(at[None], choice[None])[0]), outcome, history))
-            for at in (end, point)
-        ]
+        at = np.clip(np.array(found["x"]).ravel(), problem.low, problem.high)
+        end = problem.judge(Run(point, at, choice, float(problem.values(at[None], choice[None])[0]), outcome, history))
         # Not finite half-way, or gone astray: then the start is the better plan.
-        return best_of(runs) or runs[1]
+        best = best_of([end, start])
+        if best is not end:
+            start.outcome, start.history = ("time limit" if problem.stop else "stalled"), history
+        return best or end
 
-    def _solver(self, build: Build, interrupted: list[int], stop: Stop) -> ca.Function:
-        """Return IPOPT on −J/scale over the actions, held to the constraints, for the other inputs and the scale."""
+    def _solver(self, build: Build, interrupted: list[int], stop: Stop) -> _Solver:
+        """Return IPOPT on −J/scale over the actions, held to the constraints, for the other inputs and the scales."""
         key = Ipopt, self.iterations, self.tolerance
         if key not in build.kept:
-            expectation = build.expectation
-            actions, *others = expectation.inputs.symbols
-            scale = ca.MX.sym("scale")
-            others_and_scale = ca.veccat(*others, scale)
-            watch = _Watch(actions.numel(), others_and_scale.numel(), len(expectation.constraints))
-            problem: Any = {
-                "x": actions,
-                "p": others_and_scale,
-                "f": -expectation.value / scale,
-                "g": expectation.margins,
-            }
-            options: Any = {
-                "print_time": False,
-                "error_on_fail": False,
-                "show_eval_warnings": False,
-                "iteration_callback": watch,
-                "ipopt": {"print_level": 0, "sb": "yes", "max_iter": self.iterations, "tol": self.tolerance},
-            }
-            build.kept[key] = ca.nlpsol("ipopt", "ipopt", problem, options), watch
-        solver: ca.Function
-        solver, watch = build.kept[key]
-        watch.interrupted, watch.stop = interrupted, stop
+            build.kept[key] = _Solver(build, self.iterations, self.tolerance)
+        solver: _Solver = build.kept[key]
+        solver.watch.interrupted, solver.watch.stop = interrupted, stop
         return solver
+
+
+class _Solver:
+    """IPOPT for a tree, at any state.
+
+    Attributes:
+        function: CasADi's solver; its parameters are the inputs but the actions, the constraints' units, the scale.
+        watch: what ends it early.
+        least: lower bounds of the margins, whose upper ones are 0.
+        equalities: how many equations they hold.
+    """
+
+    def __init__(self, build: Build, iterations: int, tolerance: float) -> None:
+        expectation = build.expectation
+        actions, *others = expectation.inputs.symbols
+        scale, units = ca.MX.sym("scale"), ca.MX.sym("units", len(expectation.constraints))
+        kept = _distinct(expectation)
+        self.least = np.array([0.0 if expectation.constraints[k].is_equality else -np.inf for k in kept])
+        self.equalities = int(np.count_nonzero(self.least == 0.0))
+        parameters = ca.veccat(*others, units, scale)
+        self.watch = _Watch(actions.numel(), parameters.numel(), len(kept))
+        problem: Any = {
+            "x": actions,
+            "p": parameters,
+            "f": -expectation.value / scale,
+            "g": (expectation.margins / units)[kept],
+        }
+        options: Any = {
+            "print_time": False,
+            "error_on_fail": False,
+            "show_eval_warnings": False,
+            "iteration_callback": self.watch,
+            "ipopt": {"print_level": 0, "sb": "yes", "max_iter": iterations, "tol": tolerance},
+        }
+        self.function = ca.nlpsol("ipopt", "ipopt", problem, options)
+
+
+def _distinct(expectation: Expectation) -> list[int]:
+    """Return the constraints but for those that say the same once more, as at every visit of a loop."""
+    parts = ca.vertsplit(expectation.margins) if expectation.constraints else []
+    kept: list[int] = []
+    for k, one in enumerate(expectation.constraints):
+        alike = [other for other in kept if expectation.constraints[other].requirement is one.requirement]
+        if not any(ca.is_equal(parts[other], parts[k], SAME_DEPTH) for other in alike):
+            kept.append(k)
+    return kept
 
 
 class _Watch(ca.Callback):

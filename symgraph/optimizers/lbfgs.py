@@ -46,4 +46,4 @@ class Lbfgs(Optimizer):
             guessed, guessed_choices = problem.started_from_guesses(rng)
             points, choices = np.concatenate([guessed, points]), np.concatenate([guessed_choices, choices])
         runs, interrupted = climbed(problem, points, choices, self.iterations, self.tolerance)
-        return Search(runs, status_of(problem, runs, len(points)), interrupted)
+        return Search(runs, status_of(problem, runs), interrupted)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from symgraph.compile.kernel import NEVER, BoundKernel, Ended, Outcome, Stop
 from symgraph.objective import Situation
-from symgraph.optimizers.constrained import MET, Constrained
+from symgraph.optimizers.constrained import Constrained
 from symgraph.progress import Progress
 from symgraph.slots import Array, Choices
 
@@ -65,18 +65,38 @@ class Problem:
         values, _ = self.kernel.evaluate(points, self.one_hot(choices))
         return np.where(np.isfinite(values), values, -np.inf)
 
-    def merits(self, points: Array, choices: Choices, values: Array) -> Array:
-        """Return values (P,) at points (P, n) under choices (P, s) less penalties for requirements that are missed."""
+    def merits(self, points: Array, choices: Choices, values: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
+        """Judge samples by what a search from there may come to.
+
+        Args:
+            points: (P, n).
+            choices: (P, s).
+            values: (P,) of J.
+
+        Returns:
+            values less penalties for requirements that are missed (P,), and which points meet all (P,).
+        """
         if self.constrained is None:
-            return values
-        margins = self.constrained.margins(points, self.one_hot(choices))
+            return values, np.ones(len(points), dtype=bool)
+        hot, met = self.one_hot(choices), np.zeros(len(points), dtype=bool)
+        margins = np.full((len(points), self.constrained.count), np.nan)
+        for p in range(len(points)):
+            if p and self.stop:
+                break
+            margins[p] = self.constrained.margins(points[p : p + 1], hot[p : p + 1])[0]
         penalties = np.zeros(len(points))
         groups, which = np.unique(choices, axis=0, return_inverse=True)
         for g, group in enumerate(groups):
             rows = which.ravel() == g
             self.know(group)
             penalties[rows] = self.constrained.penalty(margins[rows], group, self.scale(group))
-        return np.where(np.isfinite(penalties), values - penalties, -np.inf)
+            met[rows] = self.constrained.share(margins[rows], group) <= 0.0
+        return np.where(np.isfinite(penalties), values - penalties, -np.inf), met
+
+    def most_promising(self, points: Array, choices: Choices) -> int:
+        """Return which of points (P, n) under choices (P, s) a single search starts from."""
+        merits, met = self.merits(points, choices, self.values(points, choices))
+        return int(np.lexsort((-merits, ~met))[0])
 
     def kernel_for(self, choice: Choices) -> BoundKernel:
         """Return the kernel that a search without constraints climbs under choices (s,): J, less penalties."""
@@ -86,21 +106,22 @@ class Problem:
         return self.constrained.penalised(choice, self.scale(choice))
 
     def judge(self, run: Run) -> Run:
-        """Give a run of penalised values the value of J, and what it misses."""
-        if self.constrained is None or not np.isfinite(run.value):
+        """Give a run under constraints the value of J, and say what it misses."""
+        if self.constrained is None:
             return run
         self.know(run.choices)
+        hot = self.one_hot(run.choices[None])
         run.value = float(self.values(run.point[None], run.choices[None])[0])
-        margins = self.constrained.margins(run.point[None], self.one_hot(run.choices[None]))
-        run.missed = float(self.constrained.missed(margins, run.choices)[0])
+        run.missed = float(self.constrained.share(self.constrained.margins(run.point[None], hot), run.choices)[0])
+        run.meets = self.constrained.meets(run.point, run.choices, hot[0])
         return run
 
     def know(self, choice: Choices) -> None:
-        """Find out how much the margins of requirements vary under choices (s,)."""
+        """Find out the units of requirements under choices (s,)."""
         if self.constrained is not None and not self.constrained.knows(choice):
             points = self.draw_points(np.random.default_rng(0), SCALE_SAMPLES, "spread")
             hot = np.tile(self.one_hot(choice[None]), (SCALE_SAMPLES, 1))
-            self.constrained.learn_spread(choice, self.constrained.margins(points, hot))
+            self.constrained.learn(choice, self.constrained.margins(points, hot))
 
     def one_hot(self, choices: Choices) -> Array:
         """Return (P, Σ sizes) one-hot rows."""
@@ -190,8 +211,7 @@ class Problem:
             tried = self.draw_choices(rng, min(self.combinations, GUESS_COMBINATIONS), evenly=True)
             tried = np.unique(np.where(choice < 0, tried, choice), axis=0)
             if len(tried) > 1:
-                there = np.tile(points[i], (len(tried), 1))
-                tried = tried[[int(np.argmax(self.merits(there, tried, self.values(there, tried))))]]
+                tried = tried[[self.most_promising(np.tile(points[i], (len(tried), 1)), tried)]]
             choices[i] = tried[0]
         return points, choices
 
@@ -207,7 +227,8 @@ class Run:
         value: the expected reward at `point`, -inf where nothing finite was met.
         outcome: why it ended.
         history: the values on the way, one per gradient.
-        missed: by how much requirements are missed, as a share of how much their margins vary.
+        missed: by how much a requirement is missed, in units of its margin.
+        meets: whether it meets all requirements, but for rounding.
     """
 
     start: Array
@@ -217,6 +238,7 @@ class Run:
     outcome: Outcome
     history: Array
     missed: float = 0.0
+    meets: bool = True
 
     @classmethod
     def of(cls, start: Array, choices: Choices, ended: Ended) -> Run:
@@ -245,8 +267,8 @@ def best_of(runs: Sequence[Run]) -> Run | None:
 
     If none does, the one that misses least.
     """
-    finite = [run for run in runs if np.isfinite(run.value) and np.isfinite(run.missed)]
+    finite = [run for run in runs if np.isfinite(run.value) and not np.isnan(run.missed)]
     if not finite:
         return None
-    meeting = [run for run in finite if run.missed <= MET]
+    meeting = [run for run in finite if run.meets]
     return max(meeting, key=lambda run: run.value) if meeting else min(finite, key=lambda run: run.missed)

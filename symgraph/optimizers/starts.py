@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -11,12 +13,12 @@ from symgraph.slots import Array, Choices
 MOST_SAMPLES = 1024  # of one combination of selections: all are compared with each other
 
 
-def status_of(problem: Problem, runs: list[Run], starts: int) -> str:
-    """Say how many starts a result is the best of, and whether combinations of selections were left out."""
+def status_of(problem: Problem, runs: Sequence[Run]) -> str:
+    """Say how many starts a result is the best of, and what makes it less than that."""
+    starts = len({run.start.tobytes() + run.choices.tobytes() for run in runs})
     tried = len({run.choices.tobytes() for run in runs})
-    if tried == problem.combinations:
-        return f"best of {starts} starts"
-    return f"best of {starts} starts, which tried {tried} of {problem.combinations} combinations of selections"
+    left_out = f", which tried {tried} of {problem.combinations} combinations of selections"
+    return f"best of {starts} starts{'' if tried == problem.combinations else left_out}"
 
 
 def climbed(
@@ -41,7 +43,7 @@ def _climbed(problem: Problem, start: Array, choice: Choices, hot: Array, iterat
     if problem.constrained is None:
         return Run.of(start, choice, problem.kernel.climb(start, hot, iterations, tolerance * scale))
     problem.know(choice)
-    ended, _ = problem.constrained.climb(start, choice, hot, iterations, tolerance, scale)
+    ended = problem.constrained.climb(start, choice, hot, iterations, tolerance, scale)
     return problem.judge(Run.of(start, choice, ended))
 
 
@@ -57,12 +59,12 @@ def promising_points(problem: Problem, rng: np.random.Generator, starts: int, sa
     by_group = values.reshape(looked_at, count)
     for group, sampled in zip(groups, by_group, strict=True):
         problem.remember_scale(group, sampled)
-    values = problem.merits(points, choices, values)
-    by_group = values.reshape(looked_at, count)
+    merits, met = problem.merits(points, choices, values)
+    by_group = merits.reshape(looked_at, count)
     peaks = _peaks(problem.unit(points).reshape(looked_at, count, problem.n), by_group, each)
     kept = (peaks + count * np.arange(looked_at)[:, None]).ravel()
     if looked_at > starts:  # not every combination has a start: those with the best samples have
-        kept = kept[np.argsort(-values[kept], kind="stable")[:starts]]
+        kept = kept[np.lexsort((-merits[kept], ~met[kept]))[:starts]]
     return points[kept], choices[kept]
 
 
