@@ -22,6 +22,7 @@ from symgraph.optimizers.starts import climbed, promising_points
 from symgraph.slots import Array, Choices
 
 SMALLEST_TOLERANCE = 1e-15  # IPOPT refuses 0
+GAIN = 1e-6  # of the scale of J
 SAME_DEPTH = 8  # operations down to which two expressions are compared
 _OUTCOMES: dict[str, Outcome] = {
     "Solve_Succeeded": "converged",
@@ -111,8 +112,10 @@ class Ipopt(Optimizer):
         history = -scale * np.array(statistics.get("iterations", {}).get("obj", [-start_value / scale]))
         at = np.clip(np.array(found["x"]).ravel(), problem.low, problem.high)
         end = problem.judge(Run(point, at, choice, float(problem.values(at[None], choice[None])[0]), outcome, history))
-        # Not finite half-way, or gone astray: then the start is the better plan.
-        best = best_of([end, start])
+        # Not finite half-way, or gone astray: then the start is the better plan. By a little it seems so, where it misses a
+        # requirement by a little.
+        gain = start.value - end.value if end.meets and outcome == "converged" else np.inf
+        best = end if gain <= GAIN * scale else best_of([end, start])
         if best is not end:
             start.outcome, start.history = ("time limit" if problem.stop else "stalled"), history
         return best or end
