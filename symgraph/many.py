@@ -6,26 +6,28 @@ import hashlib
 import itertools
 import json
 import os
+import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import cloudpickle
 import numpy as np
-from joblib import Parallel, cpu_count, delayed
+from joblib import Parallel, cpu_count, delayed, effective_n_jobs
+from joblib.externals.loky.process_executor import TerminatedWorkerError
 from joblib.parallel import get_active_backend
 
-from symgraph.errors import InputError, SolveError, StorageError, SymgraphError
+from symgraph.errors import InputError, SolveError, SymgraphError
 from symgraph.objective import Objective, Situation
+from symgraph.optimizers.lbfgs import Lbfgs
 from symgraph.optimizers.problem import Optimizer
+from symgraph.plan import Plan
+from symgraph.plan_file import PlanFile
 from symgraph.plan_table import PlanRow, PlanTable
 from symgraph.planner import Guess, solve
 from symgraph.progress import Progress
 
-FORMAT = "symgraph plans, version 1"
 BATCH_TIME = 0.2  # that a process should be busy with what it is handed at once [s]
-NOT_PLANNED = "not planned"
 
 Options = dict[str, Any]  # of solve
 
@@ -72,47 +74,57 @@ def solve_many(
         raise InputError("states is one mapping; give a list of them, or take solve for one")
     given = list(states)
     situations = [_situation(objective, state, k) for k, state in enumerate(given)]
+    count = _processes(processes)
     options: Options = {"optimizer": optimizer, "guess": guess, "fixed": fixed, "seed": seed, "time_limit": time_limit}
     keys = [_digest_of(situation) for situation in situations]
     rows: dict[str, PlanRow] = {}
+    why = "interrupted"
     with Progress("planning", progress) as bar:
         kept = None
         if file is not None:
-            bar.wait("compiling")
-            kept = _File(Path(file), _digest(objective, situations, options))
+            bar.wait("building")
+            kept = PlanFile(file, _digest(objective, options))
             rows = kept.rows
         missing = list({key: k for k, key in reversed(list(enumerate(keys))) if key not in rows}.items())[::-1]
+        total = len(rows) + len(missing)
         try:
-            for key, row in _planned(objective, [(key, given[k]) for key, k in missing], options, processes, bar):
+            for key, row in _planned(objective, [(key, given[k]) for key, k in missing], options, count, bar):
                 rows[key] = row
                 if kept is not None:
                     kept.add(key, row)
-                bar.update(len(rows), len(rows) + len(missing))
+                bar.update(len(rows), total)
         except KeyboardInterrupt:
             pass
+        except TerminatedWorkerError:
+            why = "a worker process died; call again with fewer processes"
         finally:
             if kept is not None:
                 kept.close()
-    return PlanTable(objective.graph, given, [rows.get(key, _unplanned("interrupted")) for key in keys])
+    return PlanTable(objective.graph, given, [rows.get(key, _unplanned(why)) for key in keys])
+
+
+def _processes(given: int | None) -> int:
+    """Return how many processes to plan in: those that were asked for, or that joblib was told, or the cores."""
+    _, configured = get_active_backend()
+    if given is None and configured is not None:
+        return int(effective_n_jobs(configured))
+    count = cpu_count() if given is None else given
+    if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
+        raise InputError(f"processes = {given!r}; give a positive whole number")
+    return int(count)
 
 
 def _planned(
-    objective: Objective,
-    missing: list[tuple[str, Mapping[str, Any]]],
-    options: Options,
-    processes: int | None,
-    bar: Progress,
+    objective: Objective, missing: list[tuple[str, Mapping[str, Any]]], options: Options, count: int, bar: Progress
 ) -> Iterator[tuple[str, PlanRow]]:
     """Yield the rows of situations as they are ready."""
-    _, configured = get_active_backend()
-    count = processes if processes is not None else configured if configured is not None else cpu_count()
-    if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count == 0:
-        raise InputError(f"processes = {processes!r}; give a positive whole number")
     if count == 1 or len(missing) < 2:
         for key, state in missing:
             yield key, _row(objective, state, options)
         return
-    objective.situation(missing[0][1]).build.kernel  # noqa: B018 compiled once here, found on the disk by all others
+    bar.wait("compiling")
+    build = objective.situation(missing[0][1]).build
+    build.compile()  # once here: all others find it on the disk
     blob = cloudpickle.dumps((objective, options))
     token = hashlib.sha256(blob).hexdigest()
     bar.begin("planning")
@@ -123,7 +135,7 @@ def _planned(
         while batch := list(itertools.islice(waiting, pace.size)):
             yield delayed(_batch)(token, blob, batch)
 
-    parallel = Parallel(n_jobs=int(count), return_as="generator_unordered", max_nbytes=None, pre_dispatch="2*n_jobs")
+    parallel = Parallel(n_jobs=count, return_as="generator_unordered", max_nbytes=None, pre_dispatch="2*n_jobs")
     for results, seconds in parallel(batches()):
         pace.learn(seconds, len(results))
         yield from results
@@ -140,16 +152,18 @@ class _Pace:
 
 
 _objectives: dict[str, tuple[Objective, Options]] = {}  # of this worker process: building one takes longer than a plan
+_loading = threading.Lock()  # some clusters plan in several threads of a process
 
 
 def _batch(
     token: str, blob: bytes, batch: list[tuple[str, Mapping[str, Any]]]
 ) -> tuple[list[tuple[str, PlanRow]], float]:
     """Plan for some situations in a worker process; also say how long it took."""
-    if token not in _objectives:
-        _objectives.clear()
-        _objectives[token] = cloudpickle.loads(blob)
-    objective, options = _objectives[token]
+    with _loading:
+        if token not in _objectives:
+            _objectives.clear()
+            _objectives[token] = cloudpickle.loads(blob)
+        objective, options = _objectives[token]
     begin = time.perf_counter()
     rows = [(key, _row(objective, state, options)) for key, state in batch]
     return rows, time.perf_counter() - begin
@@ -162,11 +176,12 @@ def _row(objective: Objective, state: Mapping[str, Any], options: Options) -> Pl
         return _unplanned(str(error))
     if plan.status.startswith("interrupted"):
         raise KeyboardInterrupt
-    return PlanRow(plan.actions, plan.selections, plan.value, plan.deviation, plan.violation, plan.status, plan.seconds)
+    found = plan.value, plan.deviation, plan.violation, plan.status, plan.notes, plan.seconds
+    return PlanRow(plan.actions, plan.selections, *found)
 
 
 def _unplanned(why: str) -> PlanRow:
-    return PlanRow({}, {}, np.nan, np.nan, np.nan, f"{NOT_PLANNED}: {why}", 0.0)
+    return PlanRow({}, {}, np.nan, np.nan, np.nan, f"not planned: {why}", (), 0.0)
 
 
 def _situation(objective: Objective, state: Any, k: int) -> Situation:
@@ -184,67 +199,28 @@ def _digest_of(situation: Situation) -> str:
     return hashlib.sha256(b"\0".join(parts)).hexdigest()[:32]
 
 
-def _digest(objective: Objective, situations: list[Situation], options: Options) -> str:
-    """Return what tells objectives and options apart: the expression itself, and the numbers in it."""
-    parts = [repr((objective.risk, options)).encode()]
-    if situations:
-        build = situations[0].build
-        parts.append(build.function.serialize().encode())
-        parts += [parameter.value.tobytes() for parameter in build.expectation.inputs.parameters]
-    return hashlib.sha256(b"\0".join(parts)).hexdigest()
+def _digest(objective: Objective, options: Options) -> str:
+    """Return what tells objectives and options apart: the slots, the expression itself, and the numbers in it."""
+    guess = options["guess"]
+    guesses = [] if guess is None else [guess] if isinstance(guess, (Plan, Mapping)) else guess
+    build = objective.build(frozenset())
+    content = {
+        "slots": {label: repr(slot) for label, slot in objective.graph.slots.items()},
+        "risk": objective.risk,
+        "J": build.function.serialize(),
+        "margins": build.expectation.margins_function().serialize(),
+        "sides": [(one.side, one.way) for one in build.expectation.constraints],
+        "parameters": [parameter.value for parameter in build.expectation.inputs.parameters],
+        "optimizer": repr(Lbfgs() if options["optimizer"] is None else options["optimizer"]),
+        "guesses": [{**one.actions, **one.selections} if isinstance(one, Plan) else one for one in guesses],
+        "fixed": {} if options["fixed"] is None else options["fixed"],
+        "seed": options["seed"],
+        "time_limit": options["time_limit"],
+    }
+    text = json.dumps(content, sort_keys=True, default=_plain)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
-class _File:
-    """Rows as lines of JSON; the first line says what they belong to."""
-
-    def __init__(self, path: Path, digest: str) -> None:
-        self._path = path
-        head = {"format": FORMAT, "objective": digest}
-        self.rows: dict[str, PlanRow] = {}
-        try:
-            lines = path.read_bytes().split(b"\n") if path.exists() else []
-            whole = lines[:-1]  # a killed process may have left half a line at the end
-            if whole:
-                self._read(whole, head)
-            self._file: IO[bytes] = path.open("ab")
-            if whole:
-                self._file.truncate(sum(len(line) + 1 for line in whole))
-            else:
-                self._file.truncate(0)
-                self._write(head)
-        except OSError as error:
-            if isinstance(error, StorageError):
-                raise
-            raise StorageError(f"{path}: {error.strerror}; give another file") from None
-
-    def _read(self, lines: list[bytes], head: dict[str, str]) -> None:
-        for number, line in enumerate(lines, start=1):
-            try:
-                entry = json.loads(line)
-                if number == 1:
-                    found = entry["format"], entry["objective"]
-                else:
-                    key = entry.pop("situation")
-                    self.rows[key] = PlanRow.of(entry)
-            except (ValueError, KeyError, TypeError):
-                raise StorageError(
-                    f"{self._path}: line {number} is no row of plans; give another file, or take this one away"
-                ) from None
-            if number == 1 and found != tuple(head.values()):
-                raise InputError(
-                    f"{self._path} was begun with another objective, other options or another version of symgraph; "
-                    f"give another file, or take this one away"
-                )
-
-    def add(self, key: str, row: PlanRow) -> None:
-        self._write({"situation": key, **row.plain()})
-
-    def _write(self, entry: Mapping[str, Any]) -> None:
-        try:
-            self._file.write(json.dumps(entry).encode() + b"\n")
-            self._file.flush()  # in the system's hands it survives the process
-        except OSError as error:
-            raise StorageError(f"{self._path}: {error.strerror}; make room, and call again to go on") from None
-
-    def close(self) -> None:
-        self._file.close()
+def _plain(value: Any) -> Any:
+    """Return what JSON knows for what it does not."""
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else repr(value)

@@ -73,6 +73,12 @@ class Build:
         """Likewise of the augmented Lagrangian, by which constraints are kept."""
         return make_kernel(self.expectation.merit_and_gradient(), self._compiled)
 
+    def compile(self) -> None:
+        """Make all that searches need."""
+        self.kernel  # noqa: B018 made when it is first asked for
+        if self.expectation.constraints:
+            self.merit_kernel  # noqa: B018 likewise
+
     @property
     def has_kernel(self) -> bool:
         return "kernel" in self.__dict__
@@ -225,7 +231,7 @@ class Objective:
         """Return what happens at every node: probability, the slots' Gaussians, reward and value; see `value`."""
         situation = self.situation(state)
         self.one_hot(selections)  # checks them
-        return self.outcomes_of(situation, self.stack_actions(actions), selections or {})
+        return self.outcomes_of(situation, self.stack_actions(actions), {} if selections is None else selections)
 
     def outcomes_of(self, situation: Situation, actions: Array, selections: Mapping[str, str]) -> NodeOutcomes:
         """Return the outcomes for a checked situation and stacked actions (n,)."""
@@ -281,21 +287,25 @@ class Objective:
             raise InputError(f"state {label!r} is missing: {place} reads it{hint} Missing in all: {names(missing)}")
         # A variance of zero is exact: formulas for a spread may not survive it (0 · ∞ where a slope is infinite).
         uncertain = frozenset(label for label in self.tree.needed_states if np.any(given[label].covariance))
-        if uncertain not in self._builds:
-            self._builds[uncertain] = Build(self.tree, uncertain, self._compiled, self.risk)
         empty = [np.zeros(0)]
         spread = [label for label in self.tree.needed_states if label in uncertain]
         means = [np.ravel(given[label].mean) for label in self.tree.needed_states]
         return Situation(
             given,
-            self._builds[uncertain],
+            self.build(uncertain),
             np.concatenate(means or empty),
             np.concatenate([np.ravel(given[label].covariance) for label in spread] or empty),
         )
 
+    def build(self, uncertain: frozenset[str]) -> Build:
+        """Return all that is derived from the tree for a set of uncertain start states."""
+        if uncertain not in self._builds:
+            self._builds[uncertain] = Build(self.tree, uncertain, self._compiled, self.risk)
+        return self._builds[uncertain]
+
     def stack_actions(self, actions: Mapping[str, Any] | None) -> Array:
         """Stack {label: value} of all actions to (n,) in graph order."""
-        actions = actions or {}
+        actions = {} if actions is None else actions
         slots = self.graph.actions()
         self._check_labels(actions, slots, "action")
         missing = [label for label in slots if label not in actions]
@@ -316,7 +326,7 @@ class Objective:
 
     def one_hot(self, selections: Mapping[str, str] | None) -> Array:
         """Stack {label: choice} of all selections to one-hot columns (m,) in graph order."""
-        selections = selections or {}
+        selections = {} if selections is None else selections
         slots = self.graph.selections()
         self._check_labels(selections, slots, "selection")
         missing = [label for label in slots if label not in selections]

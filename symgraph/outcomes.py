@@ -166,10 +166,11 @@ class NodeOutcomes(Sequence[NodeOutcome]):
     @cached_property
     def _values(self) -> Array:
         values = np.zeros(len(self))
-        for node in reversed(self.tree.nodes):
-            values[node.index] += self.tree.cut_value if node.cut else self._rewards[node.index]
-            if node.parent is not None and self.shares[node.index]:
-                values[node.parent] += self.shares[node.index] * values[node.index]
+        with np.errstate(invalid="ignore", over="ignore"):  # rewards need not be finite
+            for node in reversed(self.tree.nodes):
+                values[node.index] += self.tree.cut_value if node.cut else self._rewards[node.index]
+                if node.parent is not None and self.shares[node.index]:
+                    values[node.parent] += self.shares[node.index] * values[node.index]
         return values
 
     @cached_property
@@ -181,8 +182,9 @@ class NodeOutcomes(Sequence[NodeOutcome]):
             for group in node.groups:
                 children = [b.child for b in group.branches if b.child is not None and self.shares[b.child]]
                 shares, values = self.shares[children], self._values[children]
-                spread = variances[children] + (values - shares @ values) ** 2
-                variances[node.index] += shares @ spread
+                with np.errstate(invalid="ignore", over="ignore"):  # values need not be finite
+                    spread = variances[children] + (values - shares @ values) ** 2
+                    variances[node.index] += shares @ spread
         return variances
 
     @property

@@ -13,7 +13,7 @@ from symgraph.errors import InputError, did_you_mean, names
 from symgraph.graph import Graph
 from symgraph.slots import Array, Gaussian
 
-RESULTS = "value", "deviation", "violation", "status", "seconds"  # of a row
+NUMBERS = "value", "deviation", "violation", "seconds"  # of a row
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,8 +23,11 @@ class PlanRow:
     Attributes:
         actions: {label: float or (size,)} [unit]; empty where nothing was planned.
         selections: {label: choice}.
-        value, deviation, violation: as those of a `Plan`; NaN where nothing was planned.
-        status: as that of a `Plan`, or "not planned: …".
+        value: as that of a `Plan`, like all that follows; NaN where nothing was planned.
+        deviation: likewise.
+        violation: likewise.
+        status: "not planned: …" where nothing was.
+        notes: what makes the value less than it seems.
         seconds: that it took [s].
     """
 
@@ -34,17 +37,21 @@ class PlanRow:
     deviation: float
     violation: float
     status: str
+    notes: tuple[str, ...]
     seconds: float
 
     def plain(self) -> dict[str, Any]:
-        """Return it as dictionaries, lists, strings and numbers, fit for JSON."""
-        return {**self.__dict__, "actions": {label: np.asarray(x).tolist() for label, x in self.actions.items()}}
+        """Return it as dictionaries, lists, strings and numbers, fit for JSON: None stands for NaN."""
+        actions = {label: np.asarray(x).tolist() for label, x in self.actions.items()}
+        numbers = {name: x if np.isfinite(x) else None for name, x in self.__dict__.items() if name in NUMBERS}
+        return {**self.__dict__, "actions": actions, **numbers}
 
     @classmethod
     def of(cls, plain: Mapping[str, Any]) -> PlanRow:
         """Return the row that `plain` wrote."""
         actions = {label: np.array(x) if isinstance(x, list) else x for label, x in plain["actions"].items()}
-        return cls(**{**plain, "actions": actions})
+        numbers = {name: np.nan if plain[name] is None else plain[name] for name in NUMBERS}
+        return cls(**{**plain, "actions": actions, "notes": tuple(plain["notes"]), **numbers})
 
 
 class PlanTable(Sequence[PlanRow]):
@@ -85,6 +92,10 @@ class PlanTable(Sequence[PlanRow]):
         """
         found: dict[str, list[Any]] = {}
         slots = self._graph.slots
+        elements = [f"{label}[{i}]" for label, slot in slots.items() if slot.size > 1 for i in range(slot.size)]
+        clash = [label for label in slots if label in elements or label.removesuffix(" sd") in (slots.keys() - {label})]
+        if clash:
+            raise InputError(f"slot {clash[0]!r} is named like a column of another slot; rename it")
         for k, (state, row) in enumerate(zip(self.states, self.rows, strict=True)):
             for label, value in state.items():
                 gaussian = value if isinstance(value, Gaussian) else Gaussian(value)
@@ -97,11 +108,15 @@ class PlanTable(Sequence[PlanRow]):
         columns = {name: np.array([*cells, *[np.nan] * (len(self) - len(cells))]) for name, cells in found.items()}
         for label in self._graph.selections():
             columns[label] = np.array([row.selections.get(label, "") for row in self.rows], dtype=str)
-        results = {name: np.array([getattr(row, name) for row in self.rows]) for name in RESULTS}
+        results = {name: np.array([getattr(row, name) for row in self.rows], dtype=float) for name in NUMBERS}
+        results |= {
+            "status": np.array([row.status for row in self.rows], dtype=str),
+            "notes": np.array(["; ".join(row.notes) for row in self.rows], dtype=str),
+        }
         taken = [name for name in results if name in columns]
         if taken:
             raise InputError(
-                f"the table has columns {names(RESULTS)}, and the graph has a slot {taken[0]!r}; rename it"
+                f"the table has columns {names(results)}, and the graph has a slot {taken[0]!r}; rename it"
             )
         return columns | results
 

@@ -70,13 +70,14 @@ def solve(
         raise InputError(f"seed = {seed!r}; give a whole number of at least 0")
     if time_limit is not None:
         number("time_limit", time_limit, "solve", 0.0)
+    held = {} if fixed is None else fixed
     begin = time.perf_counter()
     situation = objective.situation(state)
     stop = Stop(time_limit)
     with Progress("planning", progress) as bar:
         if not situation.build.has_kernel:
             bar.wait("compiling")
-        problem = _problem(objective, situation, guess, fixed or {}, bar, stop)
+        problem = _problem(objective, situation, guess, held, bar, stop)
         bar.begin("planning")
         rng = np.random.default_rng(seed)
         selections = list(objective.graph.selections())
@@ -111,7 +112,7 @@ def solve(
         status=status,
         notes=(
             *missed[1:MOST_TOLD],
-            *_held_outside(objective, fixed or {}),
+            *_held_outside(objective, held),
             *nodes.notes(),
             *([] if explores else _seldom(lacking)),
         ),

@@ -4,11 +4,13 @@ import math
 
 import casadi as ca
 import numpy as np
-from hypothesis import HealthCheck, given, settings
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import symgraph as sg
 
+FIND = (Phase.explicit, Phase.reuse, Phase.generate)  # what was found is seldom worth minutes of shrinking
 LABELS = ("u", "v", "x", "y", "way", "other")
 NODES = ("a", "b", "c")
 QUICK = (sg.Lbfgs(starts=2, iterations=20), sg.Adadelta(starts=2, run_iterations=10), sg.Ipopt(iterations=10))
@@ -111,7 +113,7 @@ def build(slots, calls, start):
     return graph
 
 
-@settings(max_examples=400, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=400, deadline=None, phases=FIND, suppress_health_check=list(HealthCheck))
 @given(
     slots=SLOTS,
     calls=st.lists(CALLS, min_size=1, max_size=7),
@@ -141,3 +143,55 @@ def test_a_plan_or_an_error_of_ours(slots, calls, start, visits, state, optimize
             assert (np.ravel(plan.actions[label]) <= slot.upper).all()
     assert str(plan)
     plan.to_json()
+
+
+REQUIRED = st.lists(
+    st.tuples(
+        st.sampled_from(NODES),
+        st.sampled_from(
+            [
+                lambda u: u,
+                lambda x, u: x * u,
+                lambda y: y,
+                lambda x: ca.log(x),
+                lambda u, way: u**2 + way[1],
+                lambda x, u: ca.exp(5 * u) + x,
+            ]
+        ),
+        st.floats(-2, 2),
+        st.sampled_from(["low", "high", "equal"]),
+        st.sampled_from([None, 0.9]),
+    ),
+    min_size=1,
+    max_size=3,
+)
+SEARCHES = st.sampled_from([*QUICK, sg.Enumerate(QUICK[0]), sg.Bonmin()])
+
+
+@settings(max_examples=60, deadline=None, phases=FIND, suppress_health_check=list(HealthCheck))
+@given(
+    required=REQUIRED, optimizer=SEARCHES, state=STATES, fork=st.booleans(), fixed=st.sampled_from([{}, {"u": 0.25}])
+)
+def test_what_a_plan_says_of_requirements_is_so(required, optimizer, state, fork, fixed):
+    slots = {"u": sg.Action(low=-1, high=1), **FIXED_SLOTS}
+    graph = sg.Graph(slots, "a")
+    graph.edge("a", "b", lambda x, u: {"x": x + u})
+    if fork:
+        graph.choose("b", "way", {"left": ("c", lambda u: {"y": ca.vertcat(u, 1)}), "right": ("b", None)})
+    else:
+        graph.edge("b", "c")
+    graph.reward("c", lambda u, y: -ca.sumsqr(y - u))
+    for node, model, bound, side, confidence in required:
+        bounds = {"low": bound, "high": bound} if side == "equal" else {side: bound}
+        graph.require(node, model, **bounds, confidence=None if side == "equal" else confidence)
+    objective = sg.Objective(sg.unroll(graph, max_visits=2), compiled=False)
+    try:
+        plan = sg.solve(objective, state, optimizer, fixed=fixed, progress=False)
+    except sg.SolveError:
+        return
+    violation = objective.violation(state, plan.actions, plan.selections)
+    np.testing.assert_equal(plan.violation, violation)
+    assert plan.status.startswith("requirements are missed") == (not violation <= 1e-4) or violation < 1e-3
+    if "missed" not in plan.status:
+        assert violation <= 1e-3
+    assert plan.value == pytest.approx(objective.value(state, plan.actions, plan.selections))

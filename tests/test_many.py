@@ -1,6 +1,8 @@
 """solve_many: the same plans as one by one, in processes, on a cluster, kept in a file, as a table, as a map."""
 
+import fcntl
 import json
+import multiprocessing
 import os
 import random
 import signal
@@ -19,6 +21,7 @@ from small_tasks import refuses
 
 import symgraph as sg
 from symgraph import many
+from symgraph.plan_file import FORMAT
 
 ROOT = Path(__file__).parents[1]
 QUICK = sg.Lbfgs(starts=4)
@@ -134,27 +137,96 @@ def test_half_a_line_at_the_end_is_taken_away(objective, solved, tmp_path):
         assert len(solved) - before == (1 if cut < 100 else 3)
         assert len(file.read_bytes().splitlines()) == 4
     lines = [json.loads(line) for line in file.read_text().splitlines()]
-    assert lines[0]["format"] == many.FORMAT
+    assert lines[0]["format"] == FORMAT
+
+
+def refused_file(objective, file, kind, *words, **options):
+    """Planning into the file is refused, and it stays as it was."""
+    before = file.read_bytes()
+    call = {"optimizer": QUICK, "processes": 1, "file": file} | options
+    refuses(lambda: sg.solve_many(objective, states_of(2), **call), kind, str(file), *words)
+    assert file.read_bytes() == before
+
+
+def test_a_file_of_another_objective_or_other_options_is_refused(objective, tmp_path):
+    file = tmp_path / "plans"
+    sg.solve_many(objective, states_of(2), QUICK, processes=1, file=file)
+    words = "another objective, other options", "another file"
+    for options in ({"seed": 1}, {"fixed": {"arm": "weak"}}, {"optimizer": sg.Ipopt()}, {"guess": {"u": [1, 1]}}):
+        refused_file(objective, file, sg.InputError, *words, **options)
+    refused_file(sg.Objective(objective.tree, risk=1.0), file, sg.InputError, *words)
+    wider = throw()
+    wider.graph.slots["u"] = sg.Action(2, low=-2, high=2)  # the expression is the same
+    refused_file(wider, file, sg.InputError, *words)
 
 
 def test_a_file_of_something_else_is_refused(objective, tmp_path):
     file = tmp_path / "plans"
     sg.solve_many(objective, states_of(2), QUICK, processes=1, file=file)
     begun = file.read_bytes()
-    words = [str(file), "another objective, other options", "another file"]
-    for options in ({"seed": 1}, {"fixed": {"arm": "weak"}}, {"optimizer": sg.Ipopt()}):
-        call = {"optimizer": QUICK, "processes": 1, "file": file} | options
-        refuses(lambda call=call: sg.solve_many(objective, states_of(2), **call), sg.InputError, *words)
-    riskier = sg.Objective(objective.tree, risk=1.0)
-    refuses(lambda: sg.solve_many(riskier, states_of(2), QUICK, processes=1, file=file), sg.InputError, *words)
-    assert file.read_bytes() == begun
-    file.write_text("a diary\nof mine\n")
-    words = [str(file), "line 1 is no row of plans"]
-    refuses(lambda: sg.solve_many(objective, states_of(2), QUICK, processes=1, file=file), sg.StorageError, *words)
     file.write_bytes(begun + b"{}\n")
-    words = ["line 4 is no row"]
-    refuses(lambda: sg.solve_many(objective, states_of(2), QUICK, processes=1, file=file), sg.StorageError, *words)
+    refused_file(objective, file, sg.StorageError, "line 4 is no row", "take the line away")
+    for precious in (b"a diary\nof mine\n", b'{"precious": 1}', b'{"precious": 1}\n', b"[]\n"):
+        file.write_bytes(precious)
+        refused_file(objective, file, sg.StorageError, "is no file of plans")
     refuses(lambda: sg.solve_many(objective, states_of(2), QUICK, file=tmp_path), sg.StorageError, "give another file")
+
+
+def test_a_call_that_is_refused_begins_no_file(objective, tmp_path):
+    file = tmp_path / "plans"
+    for options in ({"optimizer": sg.Lbfgs}, {"seed": -1}, {"fixed": {"arm": "both"}}):
+        call = {"optimizer": QUICK, "processes": 1, "file": file} | options
+        refuses(lambda call=call: sg.solve_many(objective, states_of(2), **call), sg.InputError)
+    assert not file.exists()
+    assert len(sg.solve_many(objective, states_of(2), QUICK, processes=1, file=file)) == 2
+
+
+def test_the_same_said_otherwise_goes_on(objective, solved, tmp_path):
+    """An order, what is the default, a guess that was planned anew."""
+    states = [{"x": 1.0}, {"x": sg.Gaussian(1.5, sd=0.1)}, {"x": 2.0}]
+    for k, options in enumerate(({}, {"fixed": {}}, {"optimizer": None}, {"seed": np.int64(0)})):
+        call = {"optimizer": sg.Lbfgs(), "processes": 1, "file": tmp_path / "plans"} | options
+        sg.solve_many(objective, states[::-1] if k else states[:2], **call)
+    assert len(solved) == 3
+    for _ in range(2):
+        guess = sg.solve(objective, {"x": 1.0}, QUICK)
+        sg.solve_many(objective, states[:1], QUICK, processes=1, guess=guess, file=tmp_path / "guessed")
+    assert len(solved) == 4
+
+
+def test_two_calls_do_not_write_one_file(objective, tmp_path):
+    file = tmp_path / "plans"
+    sg.solve_many(objective, states_of(1), QUICK, processes=1, file=file)
+    with file.open("ab") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        refused_file(objective, file, sg.StorageError, "is being written by another call")
+    assert len(sg.solve_many(objective, states_of(2), QUICK, processes=1, file=file)) == 2
+
+
+@pytest.mark.parametrize("optimizer", [QUICK, sg.Ipopt()], ids=["lbfgs", "ipopt"])
+def test_threads_find_the_same(objective, optimizer):
+    states = states_of(12)
+    with joblib.parallel_config(backend="threading", n_jobs=2):
+        table = sg.solve_many(objective, states, optimizer)
+    same(table, sg.solve_many(objective, states, optimizer, processes=1))
+
+
+def fatal(u):
+    """Kills the process in which it is traced, but for the test's own."""
+    if multiprocessing.parent_process() is not None or "loky" in sys.argv[0] or os.getpid() != OWN:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return u
+
+
+OWN = int(os.environ.setdefault("SYMGRAPH_TEST_PROCESS", str(os.getpid())))
+
+
+def test_a_worker_that_dies_is_told(tmp_path):
+    graph = sg.Graph({"u": sg.Action(low=0, high=1), "x": sg.State()}, start="go")
+    graph.reward("go", lambda u, x: fatal(u) * x)
+    table = sg.solve_many(sg.Objective(sg.unroll(graph)), states_of(6), QUICK, processes=2)
+    assert len(table) == 6
+    assert table[0].status == "not planned: a worker process died; call again with fewer processes"
 
 
 def test_a_situation_without_a_plan_leaves_the_others_alone(objective, tmp_path):
@@ -190,6 +262,7 @@ import sys
 sys.path[:0] = [{root!r}, {tests!r}]
 import numpy as np
 from symgraph import many
+from symgraph.plan_file import FORMAT
 import symgraph as sg
 from test_many import QUICK, states_of, throw
 
@@ -228,12 +301,28 @@ def test_killed_at_random_moments_it_ends_with_the_same_table(objective, tmp_pat
 # The table
 
 
+def test_notes_stay_with_their_plans():
+    graph = sg.Graph({"u": sg.Action(low=0, high=1), "x": sg.State()}, start="go")
+    graph.chance("go", {"on": ("go", None), "out": ("end", None)}, lambda x: {"on": x, "out": 0.6})
+    graph.reward("end", lambda u: u)
+    table = sg.solve_many(sg.Objective(sg.unroll(graph)), [{"x": 0.5}], processes=1)
+    assert any("sum to 1.1" in note for note in table[0].notes)
+    assert "recurs more than 3 times" in table.columns["notes"][0]
+
+
+def test_labels_that_lead_to_one_column():
+    graph = sg.Graph({"u": sg.Action(2, low=0, high=1), "u[0]": sg.State()}, start="go")
+    graph.reward("go", lambda u: u[0])
+    table = sg.solve_many(sg.Objective(sg.unroll(graph)), [{"u[0]": 1.0}], processes=1)
+    refuses(lambda: table.columns, sg.InputError, "slot 'u[0]'", "rename it")
+
+
 def test_columns_hold_every_element_and_deviations(objective):
     states = [{"x": 1.0}, {"x": sg.Gaussian(2.0, sd=0.3)}]
     columns = sg.solve_many(objective, states, QUICK, processes=1).columns
     assert list(columns) == [
         *("x", "u[0]", "u[1]", "x sd", "arm"),
-        *("value", "deviation", "violation", "status", "seconds"),
+        *("value", "deviation", "violation", "seconds", "status", "notes"),
     ]
     assert columns["x"].tolist() == [1.0, 2.0]
     np.testing.assert_allclose(columns["x sd"], [np.nan, 0.3])
@@ -243,7 +332,7 @@ def test_columns_hold_every_element_and_deviations(objective):
 def test_pandas_takes_the_columns(objective):
     table = sg.solve_many(objective, states_of(4), QUICK, processes=1)
     frame = pd.DataFrame(table.columns)
-    assert frame.shape == (4, 9)
+    assert frame.shape == (4, 10)
     assert set(frame[frame.x > 2.2].arm) == {"strong"}
 
 
@@ -274,7 +363,7 @@ def test_what_does_not_fit(objective):
     refuses(lambda: sg.solve_many(objective.tree, []), sg.InputError, "takes an Objective, got Tree")
     refuses(lambda: sg.solve_many(objective, {"x": 1.0}), sg.InputError, "states is one mapping", "solve for one")
     refuses(lambda: sg.solve_many(objective, [{"x": 1.0}, {}]), sg.InputError, "states[1]: state 'x' is missing")
-    for processes in (0, 1.5, True):
+    for processes in (0, -1, 1.5, True):
         refuses(
             lambda processes=processes: sg.solve_many(objective, states_of(2), processes=processes),
             sg.InputError,

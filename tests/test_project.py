@@ -42,6 +42,7 @@ LAYERS = [
     "plan",
     "planner",
     "plan_table",
+    "plan_file",
     "many",
     "plots",
     "codegen",

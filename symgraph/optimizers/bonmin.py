@@ -99,7 +99,7 @@ class Bonmin(Optimizer):
         allowed = np.concatenate([np.isin(range(n), a) for n, a in zip(problem.sizes, problem.allowed, strict=True)])
         low = np.concatenate([problem.low, np.zeros(len(allowed))])
         high = np.concatenate([problem.high, allowed.astype(float)])
-        # Equations as narrow bands: with selections held there may be fewer unknowns than equations, which IPOPT refuses.
+        # Equations as narrow bands: with selections held there may be fewer unknowns than equations, and IPOPT refuses.
         bands = [BAND if one.is_equality else np.inf for one in situation.build.relaxed.constraints]
         # Some of its messages no option turns off. What other threads print meanwhile is lost with them.
         quiet = contextlib.redirect_stdout(io.StringIO())

@@ -20,6 +20,7 @@ from symgraph.slots import Array, Choices
 MOVE = 1e-6  # of an action's range: what such moves would make up for counts as rounding
 ROUNDING = 1e-9  # of a constraint's unit, likewise: where margins are flat, moves make up for nothing
 CLOSE = 1e-10  # of a constraint's unit: what a search goes on to
+SMALLEST_UNIT = 1e-100  # its square must still be a number
 FIRST_WEIGHT = 1000.0  # less lets a climb leave for where nothing leads back to what is required
 GROWTH = 10.0  # of weights
 MOST_GROWTH = 1e9
@@ -80,7 +81,7 @@ class Constrained:
             ranges = np.nan_to_num(np.nanmax(spread, 0, initial=-np.inf) - np.nanmin(spread, 0, initial=np.inf))
         # A quarter of all margins are no larger: a few steep ones say nothing of those near 0. Nor does an offset.
         found = np.where((quarter > 0.0) & (quarter < ranges), quarter, ranges)
-        units = np.where((found > 0.0) & np.isfinite(found), found, np.maximum(self._bounds, 1.0))
+        units = np.where((found > SMALLEST_UNIT) & np.isfinite(found), found, np.maximum(self._bounds, 1.0))
         self._units[choice.tobytes()] = np.where(self._counts(choice), units, np.inf)
 
     def knows(self, choice: Choices) -> bool:
@@ -98,7 +99,11 @@ class Constrained:
 
     def share(self, margins: Array, choice: Choices) -> Array:
         """Return the largest breach (…,) in units of the constraints, from margins (…, k)."""
-        return np.asarray((violations(margins, self._constraints) / self.units(choice)).max(axis=-1))
+        with np.errstate(invalid="ignore"):  # what does not count has an infinite unit
+            shares = np.where(
+                np.isinf(self.units(choice)), 0.0, violations(margins, self._constraints) / self.units(choice)
+            )
+        return np.asarray(shares.max(axis=-1))
 
     def meets(self, point: Array, choice: Choices, hot: Array) -> bool:
         """Whether a point (n,) meets all that counts, but for rounding."""
@@ -109,8 +114,9 @@ class Constrained:
             return True
         slack = np.zeros(self.count)
         inward = np.where(point > self._middle, -1.0, 1.0)
-        for move in inward * self._moves:
-            change = np.abs(self._margins(point + move, hot) - margins)
+        with np.errstate(invalid="ignore"):  # infinite margins
+            changes = [np.abs(self._margins(point + move, hot) - margins) for move in inward * self._moves]
+        for change in changes:
             slack += np.where(np.isfinite(change), change, 0.0)
         typical = np.where(np.isfinite(self.units(choice)), self.units(choice), 0.0) if point.size else self._bounds
         return bool((breaches <= slack + ROUNDING * typical).all())  # NaN meets nothing
@@ -160,9 +166,9 @@ class Constrained:
             if ended.outcome == "not finite":
                 return Ended(point if kept is None else kept[1], 0.0, "not finite", np.concatenate(history))
             point, margins = ended.point, self._margins(ended.point, hot)
-            pulled = np.where(weights > 0.0, multipliers + weights * margins, 0.0)
-            pulled = np.where(self._equality, pulled, np.maximum(pulled, 0.0))
-            with np.errstate(divide="ignore", invalid="ignore"):
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                pulled = np.where(weights > 0.0, multipliers + weights * margins, 0.0)
+                pulled = np.where(self._equality, pulled, np.maximum(pulled, 0.0))
                 taken = np.where(weights > 0.0, (pulled**2 - multipliers**2) / (2 * weights), 0.0).sum()
                 # By how much constraints, or the multipliers of those that do not bind, are not yet right.
                 wrong = float(np.abs(np.where(weights > 0.0, (pulled - multipliers) / weights / units, 0.0)).max())

@@ -112,8 +112,8 @@ class Ipopt(Optimizer):
         history = -scale * np.array(statistics.get("iterations", {}).get("obj", [-start_value / scale]))
         at = np.clip(np.array(found["x"]).ravel(), problem.low, problem.high)
         end = problem.judge(Run(point, at, choice, float(problem.values(at[None], choice[None])[0]), outcome, history))
-        # Not finite half-way, or gone astray: then the start is the better plan. By a little it seems so, where it misses a
-        # requirement by a little.
+        # Not finite half-way, or gone astray: then the start is the better plan. By a little it only seems so, where it
+        # misses a requirement by a little.
         gain = start.value - end.value if end.meets and outcome == "converged" else np.inf
         best = end if gain <= GAIN * scale else best_of([end, start])
         if best is not end:
