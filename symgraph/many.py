@@ -18,7 +18,7 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 from joblib.parallel import get_active_backend
 
 from symgraph.errors import InputError, SolveError, SymgraphError
-from symgraph.objective import Objective, Situation
+from symgraph.objective import Objective
 from symgraph.optimizers.lbfgs import Lbfgs
 from symgraph.optimizers.problem import Optimizer
 from symgraph.plan import Plan
@@ -26,6 +26,7 @@ from symgraph.plan_file import PlanFile
 from symgraph.plan_table import PlanRow, PlanTable
 from symgraph.planner import Guess, solve
 from symgraph.progress import Progress
+from symgraph.situation import Situation
 
 BATCH_TIME = 0.2  # that a process should be busy with what it is handed at once [s]
 

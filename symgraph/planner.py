@@ -15,13 +15,14 @@ from symgraph.compile.kernel import Stop
 from symgraph.constraints import counting
 from symgraph.errors import InputError, SolveError, did_you_mean, names
 from symgraph.exploration import Decisions, explore, lacking_models, met
-from symgraph.objective import Objective, Situation, check_choice, checked_column, stacked_index
+from symgraph.objective import Objective, check_choice, checked_column, stacked_index
 from symgraph.optimizers.constrained import ROUNDING, Constrained
 from symgraph.optimizers.lbfgs import Lbfgs
 from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
 from symgraph.optimizers.settings import number
 from symgraph.plan import Plan, PlanRun
 from symgraph.progress import Progress
+from symgraph.situation import Situation
 from symgraph.slots import Action, Array, Choices, Selection, State
 
 MOST_TOLD = 8  # requirements that a plan says to be missed

@@ -194,13 +194,13 @@ def test_plans_use_new_weights_and_nothing_is_rebuilt_or_compiled(task, monkeypa
 
         return wrapper
 
-    from symgraph import objective as objective_module
+    from symgraph import situation as situation_module
     from symgraph.compile import toolchain
 
     monkeypatch.setattr(subprocess, "run", counted("compiler", subprocess.run))
     monkeypatch.setattr(toolchain, "load", counted("load", toolchain.load))
     for name in ("expected_value", "make_kernel", "FlatFunction"):
-        monkeypatch.setattr(objective_module, name, counted(name, getattr(objective_module, name)))
+        monkeypatch.setattr(situation_module, name, counted(name, getattr(situation_module, name)))
     monkeypatch.setattr(ca.Function, "__init__", counted("Function", ca.Function.__init__))
     one.fit(*steered(-2.0))
     second = sg.solve(objective, STATE)

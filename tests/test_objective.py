@@ -6,7 +6,7 @@ import pytest
 from small_tasks import assert_close, objective_of, over_box, refuses
 
 import symgraph as sg
-from symgraph import objective as objective_module
+from symgraph import situation as situation_module
 from symgraph.compile import toolchain
 
 SLOTS = {
@@ -213,13 +213,13 @@ def test_without_rewards():
 def builds(monkeypatch):
     """Counts the expressions that are written down."""
     made = []
-    original = objective_module.expected_value
+    original = situation_module.expected_value
 
     def counted(*arguments, **options):
         made.append(arguments)
         return original(*arguments, **options)
 
-    monkeypatch.setattr(objective_module, "expected_value", counted)
+    monkeypatch.setattr(situation_module, "expected_value", counted)
     return made
 
 

@@ -19,7 +19,7 @@ SEEDS = range(10**6, 10**6 + 10)  # of situations that were never met
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory):
     """A loop that has learned to kick, its reports, and what was compiled or built after the first ten episodes."""
-    from symgraph import objective as objective_module
+    from symgraph import situation as situation_module
     from symgraph.compile import toolchain
 
     built = []
@@ -40,7 +40,7 @@ def learned(tmp_path_factory):
                 patch.setattr(subprocess, "run", counted("compiler", subprocess.run))
                 patch.setattr(toolchain, "load", counted("load", toolchain.load))
                 for name in ("expected_value", "make_kernel", "FlatFunction"):
-                    patch.setattr(objective_module, name, counted(name, getattr(objective_module, name)))
+                    patch.setattr(situation_module, name, counted(name, getattr(situation_module, name)))
                 patch.setattr(ca.Function, "__init__", counted("Function", ca.Function.__init__))
         patch.undo()
         yield one, reports, built

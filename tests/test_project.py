@@ -35,6 +35,7 @@ LAYERS = [
     "constraints",
     "expectation",
     "outcomes",
+    "situation",
     "objective",
     "progress",
     "optimizers",

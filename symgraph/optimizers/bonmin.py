@@ -11,11 +11,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from symgraph.objective import Build
 from symgraph.optimizers.ipopt import Ipopt
 from symgraph.optimizers.problem import Optimizer, Problem, Search
 from symgraph.optimizers.settings import number, positive_whole
 from symgraph.optimizers.starts import promising_points
+from symgraph.situation import Build
 from symgraph.slots import Array, Choices
 
 NO_LIMIT = 1e9  # [s]

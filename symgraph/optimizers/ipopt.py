@@ -15,10 +15,10 @@ import numpy as np
 
 from symgraph.compile.kernel import NEVER, Outcome, Stop
 from symgraph.expectation import Expectation
-from symgraph.objective import Build
 from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
 from symgraph.optimizers.settings import number, positive_whole
 from symgraph.optimizers.starts import climbed, promising_points
+from symgraph.situation import Build
 from symgraph.slots import Array, Choices
 
 SMALLEST_TOLERANCE = 1e-15  # IPOPT refuses 0

@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from symgraph.compile.kernel import NEVER, BoundKernel, Ended, Outcome, Stop
-from symgraph.objective import Situation
 from symgraph.optimizers.constrained import Constrained
 from symgraph.progress import Progress
+from symgraph.situation import Situation
 from symgraph.slots import Array, Choices
 
 SCALE_SAMPLES = 32
