@@ -87,15 +87,15 @@ def explore(problem: Problem, selections: list[str], lacking: Mapping[BoundModel
         run = problem.judge(Run(points[0], points[0], choices[0], value, "drawn", np.array([value])))
         if best is None or _rank(run) > _rank(best):
             best = run
-        if np.isfinite(run.value) and run.meets:
+        if np.isfinite(run.value) and not run.missed:
             break
     best = best or run
     best.value = best.value if np.isfinite(best.value) else np.nan
     return Search([best], status)
 
 
-def _rank(run: Run) -> tuple[bool, bool, float]:
-    return bool(np.isfinite(run.value)), run.meets, -run.missed
+def _rank(run: Run) -> tuple[bool, float]:
+    return bool(np.isfinite(run.value)), -run.missed
 
 
 def met(nodes: NodeOutcomes, lacking: Mapping[BoundModel, Decisions]) -> bool:

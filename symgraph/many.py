@@ -134,7 +134,7 @@ def _planned(
 
     def batches() -> Iterator[Any]:
         while batch := list(itertools.islice(waiting, pace.size)):
-            yield delayed(_batch)(token, blob, batch)
+            yield delayed(_batch)(token, blob, batch, os.getpid())
 
     parallel = Parallel(n_jobs=count, return_as="generator_unordered", max_nbytes=None, pre_dispatch="2*n_jobs")
     for results, seconds in parallel(batches()):
@@ -157,17 +157,26 @@ _loading = threading.Lock()  # some clusters plan in several threads of a proces
 
 
 def _batch(
-    token: str, blob: bytes, batch: list[tuple[str, Mapping[str, Any]]]
+    token: str, blob: bytes, batch: list[tuple[str, Mapping[str, Any]]], caller: int
 ) -> tuple[list[tuple[str, PlanRow]], float]:
     """Plan for some situations in a worker process; also say how long it took."""
     with _loading:
         if token not in _objectives:
+            if not _objectives and os.getppid() == caller:
+                threading.Thread(target=_follow, args=[caller], daemon=True).start()
             _objectives.clear()
             _objectives[token] = cloudpickle.loads(blob)
         objective, options = _objectives[token]
     begin = time.perf_counter()
     rows = [(key, _row(objective, state, options)) for key, state in batch]
     return rows, time.perf_counter() - begin
+
+
+def _follow(caller: int) -> None:
+    """End this worker process when the one that called it is gone, killed perhaps."""
+    while os.getppid() == caller:
+        time.sleep(1.0)
+    os._exit(1)
 
 
 def _row(objective: Objective, state: Mapping[str, Any], options: Options) -> PlanRow:

@@ -87,6 +87,8 @@ class Plan:
         lines.append(f"value {self.value + 0.0:.6g}: {self.status}")
         lines.append(f"  {gradients} gradients in {1e3 * self.seconds:.1f} ms by {self.optimizer}, seed {self.seed}")
         lines += [f"  note: {note}" for note in self.notes]
+        if self.nodes and self.deviation:
+            lines.append(f"  expected return {self.nodes[0].value:.6g}, its standard deviation {self.deviation:.4g}")
         reached = [node for node in self.nodes if node.probability]
         for node in reached[:SHOWN_NODES]:
             reward = f", reward {node.reward:.4g}" if node.reward else ""

@@ -16,7 +16,7 @@ from symgraph.constraints import counting
 from symgraph.errors import InputError, SolveError, did_you_mean, names
 from symgraph.exploration import Decisions, explore, lacking_models, met
 from symgraph.objective import Objective, check_choice, checked_column, stacked_index
-from symgraph.optimizers.constrained import ROUNDING, Constrained
+from symgraph.optimizers.constrained import Constrained
 from symgraph.optimizers.lbfgs import Lbfgs
 from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
 from symgraph.optimizers.settings import number
@@ -43,8 +43,8 @@ def solve(
 ) -> Plan:
     """Find the actions and selections with the highest expected sum of rewards that meet all requirements.
 
-    Where no plan meets them, the one that misses least, relative to how much they vary over the bounds; its status says
-    what is missed. The first call compiles the objective (a fraction of a second to a minute, kept on disk); later ones
+    Where no plan meets them, the one whose largest breach is least, and of these the best; its status says what is
+    missed. The first call compiles the objective (a fraction of a second to a minute, kept on disk); later ones
     only search. While a learned model that the plan could meet has too few samples, the plan is a random one that leads
     to it, and its status begins with "exploring".
 
@@ -95,13 +95,13 @@ def solve(
         raise SolveError(_why_not_finite(objective, situation, search))
     chosen = _names(objective, best.choices)
     nodes = objective.outcomes_of(situation, best.point, chosen)
-    breaches = objective.breaches(situation, best.point, objective.one_hot(chosen))
+    violation = float(objective.breaches(situation, best.point, objective.one_hot(chosen)).max(initial=0.0))
     status = search.status
     if search.interrupted:
         status = f"interrupted: best of {len(search.runs)} runs"
     elif stop:
         status = f"time limit: {status}"
-    missed = [] if best.meets else _told(objective, problem, best, breaches)
+    missed = _told(objective, problem, best)
     if missed:
         status = f"requirements are missed: {missed[0]}; {status}"
     planned_or_seen: dict[str, Action | State] = {**objective.graph.actions(), **objective.graph.states()}
@@ -109,7 +109,7 @@ def solve(
         actions=objective.unstack(best.point),
         selections=chosen,
         value=best.value,
-        violation=float(breaches.max(initial=0.0)),
+        violation=violation,
         status=status,
         notes=(
             *missed[1:MOST_TOLD],
@@ -138,13 +138,13 @@ def _set_in_time(stop: Stop) -> Iterator[None]:
         timer.cancel()
 
 
-def _told(objective: Objective, problem: Problem, run: Run, breaches: Array) -> list[str]:
+def _told(objective: Objective, problem: Problem, run: Run) -> list[str]:
     """Say which constraints are missed and by how much, the worst first."""
     if problem.constrained is None:
         return []
+    breaches = problem.constrained.breaches(run.point, run.choices, problem.one_hot(run.choices[None])[0])
     constraints = problem.situation.build.expectation.constraints
-    shares = breaches / problem.constrained.units(run.choices)
-    worst = [k for k in np.argsort(-shares) if not shares[k] <= ROUNDING]
+    worst = [k for k in np.argsort(-breaches) if breaches[k] != 0.0]
     return [f"{constraints[k].told(objective.tree)} by {breaches[k]:.3g}" for k in worst]
 
 
@@ -210,8 +210,7 @@ def _constrained(objective: Objective, situation: Situation, low: Array, high: A
         return None
     return Constrained(
         constraints,
-        low,
-        high,
+        *objective.bounds,
         lambda choices: counting(constraints, _names(objective, choices)),
         lambda actions, hot: situation.build.margins([actions, hot, *situation.shared])[0],
         lambda multipliers, weights: situation.bind_merit(low, high, multipliers, weights, stop),

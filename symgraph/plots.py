@@ -145,7 +145,8 @@ def _draw_map(
 def plot_map(table: PlanTable, x: str | Sequence[float], y: str | Sequence[float]) -> Figure:
     """Draw what is planned where: a marker for each combination of selections, in the colour of the value.
 
-    Crosses are situations without a plan that means something: none was found, or a model lacks samples.
+    Crosses are situations without a plan that means something: none was found, or a model lacks samples. Markers are
+    hollow where requirements are missed.
 
     Args:
         table: what `solve_many` returned.
@@ -159,20 +160,30 @@ def plot_map(table: PlanTable, x: str | Sequence[float], y: str | Sequence[float
         InputError: a column that is not there, or as many numbers as there are no rows.
         MissingExtraError: matplotlib is not installed.
     """
+    if not isinstance(table, PlanTable):
+        raise InputError(f"plot_map takes a PlanTable, got {type(table).__name__}; give what solve_many returned")
     places = [_place(table, given, name) for given, name in ((x, "x"), (y, "y"))]
     figure, axes = _figure("plot_map")
     from matplotlib.collections import PathCollection
 
     values = table.column("value")
     planned = np.array([np.isfinite(row.value) and not row.status.startswith("exploring") for row in table], dtype=bool)
+    missed = planned & np.array([row.status.startswith("requirements are missed") for row in table], dtype=bool)
     combinations = [_combination(row.selections) for row in table]
-    shown = values[planned]
+    shown = values[planned & ~missed]
     # Ranks rather than values decide the range, so that a single accident does not swallow all colours.
     low, high = np.quantile(shown, (0.05, 1.0)) if shown.size else (0.0, 1.0)
     drawn = None
     for k, combination in enumerate(dict.fromkeys(c for c, ok in zip(combinations, planned, strict=True) if ok)):
-        rows = planned & np.array([one == combination for one in combinations])
+        mine = planned & np.array([one == combination for one in combinations])
         marker = MAP_MARKERS[k % len(MAP_MARKERS)]
+        first, second = (place[mine & missed] for place in places)
+        if first.size:
+            name = f"{combination or 'plan'}, requirements missed"
+            axes.scatter(first, second, facecolors="none", edgecolors="grey", marker=marker, label=name)
+        rows = mine & ~missed
+        if not rows.any():
+            continue
         label = combination or None
         first, second = (place[rows] for place in places)
         drawn = axes.scatter(first, second, c=values[rows], marker=marker, vmin=low, vmax=high, label=label)

@@ -73,7 +73,8 @@ class Requirement:
 
     def told(self, element: int, side: Side) -> str:
         """Return what a side demands, for messages."""
-        name = self.model.name if self.low.size == 1 else f"{self.model.name}[{element}]"
+        own = self.model.name if self.model.name != "<lambda>" else f"requirement({', '.join(self.model.reads)})"
+        name = own if self.low.size == 1 else f"{own}[{element}]"
         sign = {"low": "≥", "high": "≤", "equal": "="}[side]
         bound = (self.high if side == "high" else self.low)[element]
         sure = "" if self.confidence is None else f" with probability {self.confidence:g}"

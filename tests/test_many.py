@@ -354,6 +354,14 @@ def test_a_map_has_a_marker_for_each_way(objective):
     assert axes.get_xlabel() == "x"
     assert len(sg.plot_map(table, "x", range(10)).axes[0].collections[0].get_offsets()) > 0
     plt.close("all")
+    graph = sg.Graph({"u": sg.Action(low=0, high=1), "x": sg.State()}, start="go")
+    graph.require("go", lambda u, x: u - x, low=0)
+    graph.reward("go", lambda u: -u)
+    half = sg.solve_many(sg.Objective(sg.unroll(graph)), [{"x": 0.5}, {"x": 2.0}], QUICK, processes=1)
+    drawn = {one.get_label(): one.get_offsets() for one in sg.plot_map(half, "x", "u").axes[0].collections}
+    assert len(drawn["plan, requirements missed"]) == 1
+    plt.close("all")
+    refuses(lambda: sg.plot_map(half.columns, "x", "u"), sg.InputError, "takes a PlanTable, got dict")
     refuses(lambda: sg.plot_map(table, "z", "x"), sg.InputError, "no column 'z'", "Columns: 'x'")
     refuses(lambda: sg.plot_map(table, "arm", "x"), sg.InputError, "plot_map: x = 'arm'")
     refuses(lambda: sg.plot_map(table, "x", [1, 2]), sg.InputError, "each of 10 rows")

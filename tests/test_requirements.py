@@ -379,6 +379,41 @@ def test_what_cannot_be_met_is_told():
         assert "requirements are missed" in str(plan)
 
 
+@pytest.mark.parametrize("optimizer", [None, sg.Adadelta(), sg.Enumerate(), sg.Enumerate(sg.Ipopt())], ids=repr)
+@pytest.mark.parametrize("choices", [["far", "near"], ["near", "far"]], ids=str)
+def test_where_none_can_meet_them_the_least_breach_wins_and_then_the_value(optimizer, choices):
+    graph = sg.Graph({"u": sg.Action(low=0, high=1), "way": sg.Selection(choices), "x": sg.State()}, start="go")
+    graph.choose("go", "way", {name: (name, None) for name in choices})
+    graph.require("far", lambda x: x, low=100)
+    graph.require("near", lambda x: x, low=1)
+    graph.reward("far", lambda u: 5 - u)
+    graph.reward("near", lambda u: -5 + u)
+    plan = sg.solve(objective_of(graph), {"x": 0.0}, optimizer)
+    assert (plan.selections["way"], plan.violation) == ("near", 1.0)
+    equal = sg.Graph({"u": sg.Action(low=0, high=1), "way": sg.Selection(choices)}, start="go")
+    equal.require("go", lambda u: u, low=2)
+    equal.choose("go", "way", {name: (name, None) for name in choices})
+    equal.reward("far", lambda u: -100 - u)
+    equal.reward("near", lambda u: 5 - u)
+    plan = sg.solve(objective_of(equal), {}, optimizer)
+    assert plan.violation == pytest.approx(1.0, abs=1e-6)
+    assert plan.selections["way"] == "near"
+
+
+def test_a_plan_put_back_through_fixed_is_judged_alike():
+    known = HOCK_SCHITTKOWSKI[-1]
+    objective = objective_of(known.graph())
+    plan = sg.solve(objective, {})
+    moved = {"u": plan.actions["u"] * (1 + 1e-8)}
+    assert "missed" not in sg.solve(objective, {}, fixed=moved).status
+
+
+def test_requirements_without_a_name_are_told_by_what_they_read():
+    graph = sg.Graph({"u": sg.Action(low=0, high=1)}, start="go")
+    graph.require("go", lambda u: u, low=2)
+    assert "requirement(u) ≥ 2 at 'go' by 1" in sg.solve(objective_of(graph), {}).status
+
+
 def test_selections_that_meet_requirements_come_before_better_ones():
     graph = sg.Graph({"u": sg.Action(low=0, high=1), "way": sg.Selection(["safe", "rich"])}, start="go")
     graph.choose("go", "way", {"safe": ("low", None), "rich": ("top", None)})

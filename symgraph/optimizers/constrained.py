@@ -37,7 +37,7 @@ class Constrained:
 
     Args:
         constraints: k of them.
-        low: (n,) bounds of the actions.
+        low: (n,) bounds of the actions, also of those that are held.
         high: likewise.
         counts: choices (s,) → which constraints count (k,).
         margins: actions (n,) and one-hot selections (m,) → margins (k,).
@@ -105,13 +105,15 @@ class Constrained:
             )
         return np.asarray(shares.max(axis=-1))
 
-    def meets(self, point: Array, choice: Choices, hot: Array) -> bool:
-        """Whether a point (n,) meets all that counts, but for rounding."""
+    def breaches(self, point: Array, choice: Choices, hot: Array) -> Array:
+        """Return by how much what counts is missed (k,) at a point (n,), and 0 where that is rounding.
+
+        NaN where a margin is.
+        """
         margins = self._margins(point, hot)
-        counts = self._counts(choice)
-        breaches = np.where(counts, violations(margins, self._constraints), 0.0)
-        if not breaches.any():
-            return True
+        found = np.where(self._counts(choice), violations(margins, self._constraints), 0.0)
+        if not found.any():
+            return found
         slack = np.zeros(self.count)
         inward = np.where(point > self._middle, -1.0, 1.0)
         with np.errstate(invalid="ignore"):  # infinite margins
@@ -119,7 +121,7 @@ class Constrained:
         for change in changes:
             slack += np.where(np.isfinite(change), change, 0.0)
         typical = np.where(np.isfinite(self.units(choice)), self.units(choice), 0.0) if point.size else self._bounds
-        return bool((breaches <= slack + ROUNDING * typical).all())  # NaN meets nothing
+        return np.where(found <= slack + ROUNDING * typical, 0.0, found)
 
     def penalty(self, margins: Array, choice: Choices, scale: float) -> Array:
         """Return what `penalised` takes away (…,) at margins (…, k)."""

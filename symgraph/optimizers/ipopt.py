@@ -114,7 +114,7 @@ class Ipopt(Optimizer):
         end = problem.judge(Run(point, at, choice, float(problem.values(at[None], choice[None])[0]), outcome, history))
         # Not finite half-way, or gone astray: then the start is the better plan. By a little it only seems so, where it
         # misses a requirement by a little.
-        gain = start.value - end.value if end.meets and outcome == "converged" else np.inf
+        gain = start.value - end.value if not end.missed and outcome == "converged" else np.inf
         best = end if gain <= GAIN * scale else best_of([end, start])
         if best is not end:
             start.outcome, start.history = ("time limit" if problem.stop else "stalled"), history

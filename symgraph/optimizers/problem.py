@@ -18,6 +18,7 @@ from symgraph.slots import Array, Choices
 
 SCALE_SAMPLES = 32
 FEWEST_SAMPLES = 16
+SAME = 1e-6  # breaches that differ by less are equal
 GUESS_COMBINATIONS = 1024  # of selections that a guess leaves out
 
 
@@ -110,10 +111,9 @@ class Problem:
         if self.constrained is None:
             return run
         self.know(run.choices)
-        hot = self.one_hot(run.choices[None])
         run.value = float(self.values(run.point[None], run.choices[None])[0])
-        run.missed = float(self.constrained.share(self.constrained.margins(run.point[None], hot), run.choices)[0])
-        run.meets = self.constrained.meets(run.point, run.choices, hot[0])
+        breaches = self.constrained.breaches(run.point, run.choices, self.one_hot(run.choices[None])[0])
+        run.missed = float(breaches.max(initial=0.0))
         return run
 
     def know(self, choice: Choices) -> None:
@@ -227,8 +227,7 @@ class Run:
         value: the expected reward at `point`, -inf where nothing finite was met.
         outcome: why it ended.
         history: the values on the way, one per gradient.
-        missed: by how much a requirement is missed, in units of its margin.
-        meets: whether it meets all requirements, but for rounding.
+        missed: the largest breach of a requirement, in the unit of its model, 0 if it is rounding.
     """
 
     start: Array
@@ -238,7 +237,6 @@ class Run:
     outcome: Outcome
     history: Array
     missed: float = 0.0
-    meets: bool = True
 
     @classmethod
     def of(cls, start: Array, choices: Choices, ended: Ended) -> Run:
@@ -265,10 +263,10 @@ class Optimizer(ABC):
 def best_of(runs: Sequence[Run]) -> Run | None:
     """Return the run with the highest finite value of those that meet all requirements, the first of equals.
 
-    If none does, the one that misses least.
+    If none does, the one whose largest breach is least, of equal ones that with the highest value.
     """
     finite = [run for run in runs if np.isfinite(run.value) and not np.isnan(run.missed)]
     if not finite:
         return None
-    meeting = [run for run in finite if run.meets]
-    return max(meeting, key=lambda run: run.value) if meeting else min(finite, key=lambda run: run.missed)
+    least = min(run.missed for run in finite)
+    return max((run for run in finite if run.missed <= least * (1.0 + SAME)), key=lambda run: run.value)

@@ -65,6 +65,8 @@ def promising_points(problem: Problem, rng: np.random.Generator, starts: int, sa
     kept = (peaks + count * np.arange(looked_at)[:, None]).ravel()
     if looked_at > starts:  # not every combination has a start: those with the best samples have
         kept = kept[np.lexsort((-merits[kept], ~met[kept]))[:starts]]
+    else:  # all combinations in turn: a time limit should leave none out
+        kept = kept.reshape(looked_at, -1).T.ravel()
     return points[kept], choices[kept]
 
 
