@@ -84,7 +84,7 @@ def solve_many(
         kept = None
         if file is not None:
             bar.wait("building")
-            kept = PlanFile(file, _digest(objective, options))
+            kept = PlanFile(file, _belongs(objective, options))
             rows = kept.rows
         missing = list({key: k for k, key in reversed(list(enumerate(keys))) if key not in rows}.items())[::-1]
         total = len(rows) + len(missing)
@@ -209,26 +209,32 @@ def _digest_of(situation: Situation) -> str:
     return hashlib.sha256(b"\0".join(parts)).hexdigest()[:32]
 
 
-def _digest(objective: Objective, options: Options) -> str:
+def _belongs(objective: Objective, options: Options) -> dict[str, Any]:
     """Return what tells objectives and options apart: the slots, the expression itself, and the numbers in it."""
     guess = options["guess"]
-    guesses = [] if guess is None else [guess] if isinstance(guess, (Plan, Mapping)) else guess
+    guesses = [] if guess is None else [guess] if isinstance(guess, (Plan, PlanRow, Mapping)) else guess
     build = objective.build(frozenset())
     content = {
         "slots": {label: repr(slot) for label, slot in objective.graph.slots.items()},
-        "risk": objective.risk,
         "J": build.function.serialize(),
         "margins": build.expectation.margins_function().serialize(),
         "sides": [(one.side, one.way) for one in build.expectation.constraints],
         "parameters": [parameter.value for parameter in build.expectation.inputs.parameters],
-        "optimizer": repr(Lbfgs() if options["optimizer"] is None else options["optimizer"]),
-        "guesses": [{**one.actions, **one.selections} if isinstance(one, Plan) else one for one in guesses],
-        "fixed": {} if options["fixed"] is None else options["fixed"],
-        "seed": options["seed"],
-        "time_limit": options["time_limit"],
     }
-    text = json.dumps(content, sort_keys=True, default=_plain)
-    return hashlib.sha256(text.encode()).hexdigest()
+    planned = [{**one.actions, **one.selections} if isinstance(one, (Plan, PlanRow)) else one for one in guesses]
+    return {
+        "objective": hashlib.sha256(_text(content).encode()).hexdigest(),
+        "risk": objective.risk,
+        "optimizer": repr(Lbfgs() if options["optimizer"] is None else options["optimizer"]),
+        "guess": _text(planned),
+        "fixed": _text({} if options["fixed"] is None else options["fixed"]),
+        "seed": _text(options["seed"]),
+        "time_limit": _text(options["time_limit"]),
+    }
+
+
+def _text(value: Any) -> str:
+    return json.dumps(value, sort_keys=True, default=_plain)
 
 
 def _plain(value: Any) -> Any:

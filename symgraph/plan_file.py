@@ -22,7 +22,7 @@ class PlanFile:
 
     Args:
         path: of the file; need not be there.
-        digest: of the objective and the options.
+        belongs: what the rows belong to, {what: text or number}.
 
     Attributes:
         rows: {situation: row} that the file held when it was opened.
@@ -32,9 +32,13 @@ class PlanFile:
         InputError: it belongs to another objective or other options.
     """
 
-    def __init__(self, path: str | os.PathLike[str], digest: str) -> None:
-        self._path = Path(path)
-        self._head = _line({"format": FORMAT, "objective": digest})
+    def __init__(self, path: str | os.PathLike[str], belongs: Mapping[str, Any]) -> None:
+        try:
+            self._path = Path(path)
+        except TypeError:
+            raise InputError(f"file = {path!r} is no path") from None
+        self._belongs = {"format": FORMAT, **belongs}
+        self._head = _line(self._belongs)
         self.rows: dict[str, PlanRow] = {}
         try:
             new = not self._path.exists()
@@ -70,10 +74,12 @@ class PlanFile:
         end = content.rfind(b"\n") + 1  # a killed process may have left half a line
         lines = content[:end].splitlines(keepends=True)
         begun = lines[0] if lines else content
-        if lines and begun != self._head and _is_head(begun):
+        found = _head_of(begun) if lines and begun != self._head else None
+        if found is not None:
+            other = [what for what in self._belongs if found.get(what) != self._belongs[what]]
             raise InputError(
-                f"{self._path} was begun with another objective, other options or another version of symgraph; "
-                f"give another file, or take this one away"
+                f"{self._path} was begun with another {' and '.join(other) or 'version of symgraph'}; give another "
+                f"file, or take this one away"
             )
         if begun != self._head and (lines or not self._head.startswith(begun)):
             raise StorageError(f"{self._path} is no file of plans; give another")
@@ -108,8 +114,10 @@ def _line(entry: Mapping[str, Any]) -> bytes:
     return json.dumps(entry, allow_nan=False).encode() + b"\n"
 
 
-def _is_head(line: bytes) -> bool:
+def _head_of(line: bytes) -> dict[str, Any] | None:
+    """Return what a first line says, None if it is of something else."""
     try:
-        return bool(json.loads(line)["format"].startswith("symgraph plans"))
+        found = json.loads(line)
+        return found if found["format"].startswith("symgraph plans") else None
     except (ValueError, KeyError, TypeError, AttributeError):
-        return False
+        return None

@@ -128,6 +128,12 @@ class PlanTable(Sequence[PlanRow]):
             )
         return self.columns[name]
 
+    def with_unit(self, name: str) -> str:
+        """Return a column's name with the unit of its slot, if it has one."""
+        slot = self._graph.slots.get(name.removesuffix(" sd").partition("[")[0])
+        unit = getattr(slot, "unit", "")
+        return f"{name} [{unit}]" if unit else name
+
     def __repr__(self) -> str:
         planned = sum(np.isfinite(row.value) for row in self.rows)
         return f"<plans for {planned} of {len(self)} situations>"

@@ -21,13 +21,14 @@ from symgraph.optimizers.lbfgs import Lbfgs
 from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
 from symgraph.optimizers.settings import number
 from symgraph.plan import Plan, PlanRun
+from symgraph.plan_table import PlanRow
 from symgraph.progress import Progress
 from symgraph.situation import Situation
 from symgraph.slots import Action, Array, Choices, Selection, State
 
 MOST_TOLD = 8  # requirements that a plan says to be missed
 
-Guess = Plan | Mapping[str, Any]
+Guess = Plan | PlanRow | Mapping[str, Any]
 
 
 def solve(
@@ -52,7 +53,8 @@ def solve(
         objective: what to maximise.
         state: label → number, array or Gaussian [unit], as in `Objective.value`.
         optimizer: `Lbfgs()` if left out: it finds the best plan soonest; `Adadelta()`, `Ipopt()`, … otherwise.
-        guess: start points to add: a plan, {label: value} of some actions and selections, or a list of them.
+        guess: start points to add: a plan, a row of `solve_many`, {label: value} of some actions and selections, or a
+            list of them.
         fixed: {label: value} of actions and selections that are held.
         seed: of all that is random; the same seed gives the same plan, unless time runs out.
         time_limit: after which the best so far is returned [s]; building and compiling at first use come on top.
@@ -232,16 +234,16 @@ def _held_outside(objective: Objective, fixed: Mapping[str, Any]) -> list[str]:
 def _listed(guess: Guess | Sequence[Guess] | None) -> list[Guess]:
     if guess is None:
         return []
-    if isinstance(guess, (Plan, Mapping)):
+    if isinstance(guess, (Plan, PlanRow, Mapping)):
         return [guess]
-    if isinstance(guess, Sequence) and all(isinstance(one, (Plan, Mapping)) for one in guess):
+    if isinstance(guess, Sequence) and all(isinstance(one, (Plan, PlanRow, Mapping)) for one in guess):
         return list(guess)
     raise InputError(f"guess is {guess!r}; give a plan, {{label: value}}, or a list of them")
 
 
 def _guess(objective: Objective, guess: Guess, allowed: Mapping[str, tuple[int, ...]]) -> tuple[Any, Any]:
     """Turn a guess into actions (n,), NaN where left out, and choices (s,), -1 where left out or ruled out."""
-    values = {**guess.actions, **guess.selections} if isinstance(guess, Plan) else guess
+    values = guess if isinstance(guess, Mapping) else {**guess.actions, **guess.selections}
     where = stacked_index(objective.graph.actions())
     point = np.full(objective.n_actions, np.nan)
     choices = dict.fromkeys(allowed, -1)

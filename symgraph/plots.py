@@ -192,8 +192,8 @@ def plot_map(table: PlanTable, x: str | Sequence[float], y: str | Sequence[float
         axes.scatter(first, second, color="grey", marker="x", label="no plan")
     if drawn is not None:
         figure.colorbar(drawn, ax=axes, label="value", extend="min" if (shown < low).any() else "neither")
-    axes.set_xlabel(x if isinstance(x, str) else "")
-    axes.set_ylabel(y if isinstance(y, str) else "")
+    axes.set_xlabel(table.with_unit(x) if isinstance(x, str) else "")
+    axes.set_ylabel(table.with_unit(y) if isinstance(y, str) else "")
     if any(combinations):
         legend = figure.legend(loc="outside upper center", ncols=4, frameon=False)
         for handle in legend.legend_handles:  # colours mean values, also those that stand in the legend by chance

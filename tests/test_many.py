@@ -151,13 +151,12 @@ def refused_file(objective, file, kind, *words, **options):
 def test_a_file_of_another_objective_or_other_options_is_refused(objective, tmp_path):
     file = tmp_path / "plans"
     sg.solve_many(objective, states_of(2), QUICK, processes=1, file=file)
-    words = "another objective, other options", "another file"
     for options in ({"seed": 1}, {"fixed": {"arm": "weak"}}, {"optimizer": sg.Ipopt()}, {"guess": {"u": [1, 1]}}):
-        refused_file(objective, file, sg.InputError, *words, **options)
-    refused_file(sg.Objective(objective.tree, risk=1.0), file, sg.InputError, *words)
+        refused_file(objective, file, sg.InputError, f"begun with another {next(iter(options))};", **options)
+    refused_file(sg.Objective(objective.tree, risk=1.0), file, sg.InputError, "begun with another objective and risk;")
     wider = throw()
     wider.graph.slots["u"] = sg.Action(2, low=-2, high=2)  # the expression is the same
-    refused_file(wider, file, sg.InputError, *words)
+    refused_file(wider, file, sg.InputError, "begun with another objective;")
 
 
 def test_a_file_of_something_else_is_refused(objective, tmp_path):
@@ -192,6 +191,13 @@ def test_the_same_said_otherwise_goes_on(objective, solved, tmp_path):
         guess = sg.solve(objective, {"x": 1.0}, QUICK)
         sg.solve_many(objective, states[:1], QUICK, processes=1, guess=guess, file=tmp_path / "guessed")
     assert len(solved) == 4
+
+
+def test_a_row_is_a_guess(objective):
+    row = sg.solve_many(objective, states_of(1), QUICK, processes=1)[0]
+    plan = sg.solve(objective, states_of(1)[0], sg.Ipopt(), guess=row)
+    assert plan.value == pytest.approx(row.value, abs=1e-6)
+    refuses(lambda: sg.solve_many(objective, states_of(1), processes=1, file=3), sg.InputError, "file = 3 is no path")
 
 
 def test_two_calls_do_not_write_one_file(objective, tmp_path):
