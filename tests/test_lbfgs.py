@@ -50,13 +50,15 @@ def test_each_combination_has_at_least_one_start_up_to_the_number_of_starts():
     for label in slots:
         graph.reward("n", sg.Model(lambda s, u: s[2] - (u - 0.25) ** 2, rename={"s": label}))
     objective = objective_of(graph)
-    for starts, runs in ((27, 27), (40, 27), (5, 5), (54, 54)):
+    for starts, runs in ((27, 27), (40, 27), (5, None), (54, 54)):
         plan = sg.solve(objective, {}, sg.Lbfgs(starts=starts))
         combinations = {tuple(run.selections.values()) for run in plan.runs}
-        assert len(plan.runs) == runs
-        assert len(combinations) == min(27, starts)
-    assert plan.selections == dict.fromkeys(slots, "c")
-    assert plan.value == pytest.approx(3)
+        if runs is None:  # fewer than there are combinations: neighbours come on top
+            assert starts < len(combinations) == len(plan.runs) <= 27
+        else:
+            assert (len(plan.runs), len(combinations)) == (runs, 27)
+        assert plan.selections == dict.fromkeys(slots, "c")
+        assert plan.value == pytest.approx(3)
 
 
 def test_starts_are_the_promising_samples_and_far_apart():
@@ -130,3 +132,17 @@ def test_ctrl_c_before_anything_is_finished_is_ctrl_c(monkeypatch):
     )
     with pytest.raises(KeyboardInterrupt):
         sg.solve(over_box(lambda u: -(u**2), 0.0, 1.0), {})
+
+
+def test_more_combinations_than_starts_are_improved_by_neighbours():
+    """Twelve switches of which each must be on: samples of sixteen combinations show only some."""
+    slots = {"u": sg.Action(low=-1, high=1)} | {f"s{k}": sg.Selection(["off", "on"]) for k in range(12)}
+    graph = sg.Graph(slots, start="here")
+    for k in range(12):
+        graph.reward("here", sg.Model(lambda s, u: s[1] - (u - 0.5) ** 2, rename={"s": f"s{k}"}))
+    plan = sg.solve(objective_of(graph), {}, sg.Lbfgs(starts=4))
+    assert set(plan.selections.values()) == {"on"}
+    assert plan.value == pytest.approx(12.0)
+    assert "of 4096 combinations of selections" in plan.status
+    held = sg.solve(objective_of(graph), {}, sg.Lbfgs(starts=4), fixed={"s3": "off"})
+    assert held.value == pytest.approx(11.0)
