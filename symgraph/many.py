@@ -133,7 +133,11 @@ def _planned(
     pace = _Pace()
 
     def batches() -> Iterator[Any]:
-        while batch := list(itertools.islice(waiting, pace.size)):
+        left = len(missing)
+        while left:
+            # Smaller ones towards the end, so that no process is idle while another still has much to do.
+            batch = list(itertools.islice(waiting, max(1, min(pace.size, left // (3 * count)))))
+            left -= len(batch)
             yield delayed(_batch)(token, blob, batch, os.getpid())
 
     parallel = Parallel(n_jobs=count, return_as="generator_unordered", max_nbytes=None, pre_dispatch="2*n_jobs")
