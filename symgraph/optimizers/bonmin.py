@@ -14,7 +14,7 @@ import numpy as np
 from symgraph.optimizers.ipopt import Ipopt
 from symgraph.optimizers.problem import Optimizer, Problem, Search
 from symgraph.optimizers.settings import number, positive_whole
-from symgraph.optimizers.starts import promising_points
+from symgraph.optimizers.starts import most_promising_point
 from symgraph.situation import Build
 from symgraph.slots import Array, Choices
 
@@ -60,8 +60,7 @@ class Bonmin(Optimizer):
         if problem.guesses:
             points, choices = problem.started_from_guesses(rng)
         else:
-            groups = min(self.samples, problem.combinations)
-            points, choices = promising_points(problem, rng, groups, max(1, self.samples // groups))
+            points, choices = most_promising_point(problem, rng, self.samples)
         best = problem.most_promising(points, choices)
         point, choice = points[best], choices[best]
         problem.progress.wait("planning")

@@ -17,7 +17,7 @@ from symgraph.compile.kernel import NEVER, Outcome, Stop
 from symgraph.expectation import Expectation
 from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
 from symgraph.optimizers.settings import number, positive_whole
-from symgraph.optimizers.starts import climbed, promising_points
+from symgraph.optimizers.starts import climbed, most_promising_point
 from symgraph.situation import Build
 from symgraph.slots import Array, Choices
 
@@ -60,11 +60,7 @@ class Ipopt(Optimizer):
         if problem.guesses:
             points, choices = problem.started_from_guesses(rng)
         else:
-            # One candidate for each combination of selections.
-            groups = min(self.samples, problem.combinations)
-            points, choices = promising_points(problem, rng, groups, max(1, self.samples // groups))
-            best = problem.most_promising(points, choices)
-            points, choices = points[best : best + 1], choices[best : best + 1]
+            points, choices = most_promising_point(problem, rng, self.samples)
         runs: list[Run] = []
         problem.progress.wait("planning")
         with _interrupts() as interrupted:

@@ -70,6 +70,14 @@ def promising_points(problem: Problem, rng: np.random.Generator, starts: int, sa
     return points[kept], choices[kept]
 
 
+def most_promising_point(problem: Problem, rng: np.random.Generator, samples: int) -> tuple[Array, Choices]:
+    """Return the best (1, n) of samples spread over the bounds and all combinations of selections, with its choices."""
+    groups = min(samples, problem.combinations)  # one candidate for each
+    points, choices = promising_points(problem, rng, groups, max(1, samples // groups))
+    best = problem.most_promising(points, choices)
+    return points[best : best + 1], choices[best : best + 1]
+
+
 def _peaks(unit: Array, values: Array, count: int) -> npt.NDArray[np.int64]:
     """Return in each group the best sample and those of the better half that lie farthest from any better one.
 
