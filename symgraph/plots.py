@@ -195,9 +195,9 @@ def plot_map(table: PlanTable, x: str | Sequence[float], y: str | Sequence[float
     axes.set_xlabel(table.with_unit(x) if isinstance(x, str) else "")
     axes.set_ylabel(table.with_unit(y) if isinstance(y, str) else "")
     if any(combinations):
-        legend = figure.legend(loc="outside upper center", ncols=4, frameon=False)
+        legend = figure.legend(loc="outside upper center", ncols=2, frameon=False)
         for handle in legend.legend_handles:  # colours mean values, also those that stand in the legend by chance
-            if isinstance(handle, PathCollection):
+            if isinstance(handle, PathCollection) and handle.get_array() is not None:
                 handle.set_array(None)
                 handle.set_color("grey")
     return figure
