@@ -47,14 +47,20 @@ class Mixture:
         """(m, 1)."""
         return self.means if len(self.weights) == 1 else ca.mtimes(self.means, ca.DM(self.weights))
 
-    @property
-    def covariance(self) -> ca.MX:
-        """(m, m): within the components and between them; without non-zeros for a single point."""
-        m = self.means.shape[0]
-        total = ca.MX(m, m) if self.within is None else self.within
+    def covariance(self, begin: int = 0, end: int | None = None) -> ca.MX:
+        """Return the covariance of outputs, of all (m, m) or from `begin` to `end`; without non-zeros for a single point.
+
+        It is that within the components and that between them. For one output it costs far less than a part of the whole.
+        """
+        rows = slice(begin, self.means.shape[0] if end is None else end)
+        m = rows.stop - rows.start
+        if self.within is None or self.variances is None:
+            total = ca.MX(m, m)
+        else:
+            total = ca.mtimes(self.variances[rows, :], ca.DM(self.weights)) if m == 1 else self.within[rows, rows]
         if len(self.weights) == 1:
             return total
-        deviations = self.means - ca.repmat(self.mean, 1, len(self.weights))
+        deviations = (self.means - ca.repmat(self.mean, 1, len(self.weights)))[rows, :]
         return total + ca.mtimes(deviations * ca.repmat(ca.DM(self.weights).T, m, 1), deviations.T)
 
 
@@ -93,7 +99,7 @@ def _diagonal(layers: Layers, mean: ca.MX, root: ca.MX, held: bool = False) -> M
     variance = None
     for weight, bias in layers[:-1]:
         mean = _affine(weight, mean, bias)
-        before = ca.sum2(ca.mtimes(weight, root) ** 2) if variance is None else ca.mtimes(weight * weight, variance)
+        before = _spread(weight, root) if variance is None else ca.mtimes(weight * weight, variance)
         if held:
             mean, variance = rectify_held(mean, before)
         else:
@@ -103,7 +109,8 @@ def _diagonal(layers: Layers, mean: ca.MX, root: ca.MX, held: bool = False) -> M
     mean = _affine(weight, mean, bias)
     if variance is None:
         return _single(mean, _outer(ca.mtimes(weight, root)))
-    return _single(mean, ca.mtimes(weight * ca.repmat(variance.T, weight.shape[0], 1), weight.T))
+    covariance = ca.mtimes(weight * ca.repmat(variance.T, weight.shape[0], 1), weight.T)
+    return Mixture(mean, np.ones(1), ca.mtimes(weight * weight, variance), covariance, lambda _: covariance)
 
 
 def _paper(layers: Layers, mean: ca.MX, root: ca.MX) -> Mixture:
@@ -139,7 +146,7 @@ def _low_rank_columns(layers: Layers, columns: ca.MX, root: ca.MX, weights: Arra
     # (h, K) means; for each direction (h, K) the units' shares in it; (h, K) the units' own variances, at first none
     weight, bias = layers[0]
     means = _affine(weight, columns, bias)
-    slopes = ca.mtimes(weight, root)
+    slopes = _directions(weight, root)
     shares = [ca.repmat(slopes[:, j], 1, count) for j in range(directions)]
     own: ca.MX | None = None
     for next_weight, next_bias in layers[1:]:
@@ -201,6 +208,38 @@ def _auto(layers: Layers, mean: ca.MX, root: ca.MX) -> Mixture:
 
 
 MOST_SPLIT = 6  # uncertain directions that "auto" splits along
+
+
+def _directions(weight: ca.MX, root: ca.MX) -> ca.MX:
+    """Return weight · root (h, d); where a direction is that of a single input, one number scales a column of weights."""
+    alone, rows, others = _directions_of(root)
+    parts = []
+    if rows:
+        parts.append(weight[:, rows] * ca.repmat(alone.T, weight.shape[0], 1))
+    if others is not None:
+        parts.append(ca.mtimes(weight, others))
+    return ca.horzcat(*parts)
+
+
+def _spread(weight: ca.MX, root: ca.MX) -> ca.MX:
+    """Return the diagonal (h, 1) of weight · root rootᵀ · weightᵀ."""
+    alone, rows, others = _directions_of(root)
+    total = ca.MX(weight.shape[0], 1)
+    if rows:
+        total += ca.mtimes(weight[:, rows] ** 2, alone**2)
+    if others is not None:
+        total += ca.sum2(ca.mtimes(weight, others) ** 2)
+    return total
+
+
+def _directions_of(root: ca.MX) -> tuple[ca.MX, list[int], ca.MX | None]:
+    """Split directions (n, d) into those of single inputs, as numbers (k, 1) and inputs, and the others (n, d - k)."""
+    edges, found = root.sparsity().colind(), root.sparsity().row()
+    single = [j for j in range(root.shape[1]) if edges[j + 1] - edges[j] == 1]
+    others = [j for j in range(root.shape[1]) if j not in set(single)]
+    rows = [found[edges[j]] for j in single]
+    alone = ca.vertcat(*[root[row, j] for row, j in zip(rows, single, strict=True)])
+    return alone, rows, root[:, others] if others else None
 
 
 def _moved(mean: ca.MX, root: ca.MX, rule: cubature.Rule) -> ca.MX:

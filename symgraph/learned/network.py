@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -150,12 +150,9 @@ class StochasticNetwork(LearnedModel):
     def propagate(self, inputs: Mapping[str, Gaussian]) -> dict[str, Gaussian]:
         """Return the Gaussians of what it writes, as expressions of its parameters."""
         y, covariance = self._moments(*self._stacked(inputs))
-        written, at = {}, 0
-        for label, size in self.writes.items():
-            rows = slice(at, at + size)
-            written[label] = Gaussian(y[rows], covariance[rows, rows])
-            at += size
-        return written
+        edges = itertools.accumulate(self.writes.values(), initial=0)
+        parts = zip(self.writes, itertools.pairwise(edges), strict=True)
+        return {label: Gaussian(y[begin:end], covariance(begin, end)) for label, (begin, end) in parts}
 
     def predict(self, mean: Any, covariance: Any = None) -> tuple[Array, Array]:
         """Return mean and covariance of the outputs.
@@ -300,15 +297,15 @@ class StochasticNetwork(LearnedModel):
         sd = output if self.error == "paper" else np.logaddexp(0.0, output) + losses.LEAST_DEVIATION
         return (sd * self._error_scale.value[:, 0]) ** 2
 
-    def _moments(self, mean: ca.MX, root: ca.MX | None) -> tuple[ca.MX, ca.MX]:
-        """Return mean (m, 1) and covariance (m, m) of the outputs for an input N(mean, root rootᵀ)."""
+    def _moments(self, mean: ca.MX, root: ca.MX | None) -> tuple[ca.MX, Callable[[int, int], ca.MX]]:
+        """Return the outputs' mean (m, 1), and their covariance from one to another, for an input N(mean, root rootᵀ)."""
         passed = pass_through(self.propagation, self._mean.layers, mean, root)
         if self.error == "none":
             return passed.mean, passed.covariance
         errors = pass_through(self.propagation, self._error.layers, mean, root)
         scale = self._error_scale.symbol
-        variance = errors.mean**2 if self.error == "paper" else _expected_square(errors)
-        return passed.mean, passed.covariance + ca.diag(variance * scale**2)
+        variance = (errors.mean**2 if self.error == "paper" else _expected_square(errors)) * scale**2
+        return passed.mean, lambda begin, end: passed.covariance(begin, end) + ca.diag(variance[begin:end])
 
     def _numbers(self, covariance: Array) -> FlatFunction:
         """Return the function that predicts for a covariance (n, n) of this structure: what a graph would compute."""
@@ -323,8 +320,9 @@ class StochasticNetwork(LearnedModel):
         if key not in self._built:
             n = self._mean.sizes[0]
             mean, sigma = ca.MX.sym("mean", n), ca.MX.sym("sigma", n, n)
-            roots = [ca.mtimes(ca.DM(np.eye(n)[:, rows]), square_root(sigma[rows, rows])) for rows in uncertain]
-            moments = self._moments(mean, ca.horzcat(*roots) if roots else None)
+            roots = [ca.mtimes(ca.sparsify(ca.DM(np.eye(n)[:, rows])), square_root(sigma[rows, rows])) for rows in uncertain]
+            y, covariance = self._moments(mean, ca.horzcat(*roots) if roots else None)
+            moments = y, covariance(0, y.numel())
             symbols = [mean, sigma, *(p.symbol for p in self.parameters)]
             self._built[key] = FlatFunction(ca.Function("predict", symbols, [ca.densify(part) for part in moments]))
         return self._built[key]

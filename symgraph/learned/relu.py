@@ -35,9 +35,10 @@ class Rectified:
 def rectify(mean: ca.MX, variance: ca.MX) -> Rectified:
     """Return the moments of max(0, x), element by element."""
     sd = ca.sqrt(variance + FLOOR)
-    alpha = mean / sd
-    gain = 0.5 + 0.5 * ca.erf(alpha * math.sqrt(0.5))
-    density = ca.exp(-0.5 * alpha * alpha) * (1 / math.sqrt(2 * math.pi))
+    alpha = mean * (1 / sd)  # the slope of 1/s needs no further division
+    x = alpha * math.sqrt(0.5)
+    gain = 0.5 + 0.5 * ca.erf(x)
+    density = ca.exp(-(x * x)) * (1 / math.sqrt(2 * math.pi))  # an exponential that the slope of erf(x) holds too
     rectified = mean * gain + sd * density
     # E[max(0, x)²] - E² with E[max(0, x)²] = vΦ + mE; written so that nothing cancels where m is many s above zero.
     spread = variance * gain + (mean - rectified) * rectified
