@@ -102,29 +102,38 @@ class Expectation:
     constraints: tuple[Constraint, ...]
     flat: bool
 
+    def value_function(self) -> ca.Function:
+        """Return the function inputs → J (1, 1)."""
+        return ca.Function("objective", self.inputs.symbols, [self.value], {"cse": True})
+
     def value_and_gradient(self) -> ca.Function:
         """Return the function inputs → J (1, 1), ∂J/∂actions (n, 1)."""
-        return self._with_gradient(self.value, self.inputs.symbols)
+        return self._with_gradient(self.value_function())
 
-    def merit_and_gradient(self) -> ca.Function:
-        """Return the function inputs, λ (k, 1), w (k, 1) → J - Σ penalties, its gradient (n, 1); see `merit`."""
+    def merit_function(self) -> ca.Function:
+        """Return the function inputs, λ (k, 1), w (k, 1) → J - Σ penalties; see `merit`."""
         multipliers, weights = (ca.MX.sym(name, len(self.constraints)) for name in ("multipliers", "weights"))
         penalised = merit(self.value, self.margins, multipliers, weights, self.constraints)
-        return self._with_gradient(penalised, [*self.inputs.symbols, multipliers, weights])
+        return ca.Function("merit", [*self.inputs.symbols, multipliers, weights], [penalised], {"cse": True})
+
+    def merit_and_gradient(self) -> ca.Function:
+        """Return the same with its gradient (n, 1)."""
+        return self._with_gradient(self.merit_function())
 
     def margins_function(self) -> ca.Function:
         """Return the function inputs → margins (k, 1)."""
         return ca.Function("margins", self.inputs.symbols, [ca.densify(self.margins)])
 
-    def _with_gradient(self, value: ca.MX, inputs: list[ca.MX]) -> ca.Function:
+    def _with_gradient(self, function: ca.Function) -> ca.Function:
+        symbols = function.mx_in()
         if not self.flat:
-            gradient = ca.gradient(value, self.inputs.actions)
-            return ca.Function("objective", inputs, [value, gradient], {"cse": True})
-        flat = ca.Function("J", inputs, [value]).expand()
-        symbols = flat.sx_in()
-        expanded = flat.call(symbols)[0]
-        results = ca.cse([expanded, ca.gradient(expanded, symbols[0])])
-        return ca.Function("objective", symbols, [ca.densify(r) for r in results])
+            (value,) = function.call(symbols, True, False)
+            return ca.Function("objective", symbols, [value, ca.gradient(value, symbols[0])], {"cse": True})
+        flat = function.expand()
+        scalars = flat.sx_in()
+        expanded = flat.call(scalars)[0]
+        results = ca.cse([expanded, ca.gradient(expanded, scalars[0])])
+        return ca.Function("objective", scalars, [ca.densify(r) for r in results])
 
     def hessian(self) -> ca.Function:
         """Return the function inputs → ∂²J/∂actions² (n, n)."""

@@ -19,7 +19,7 @@ from symgraph.objective import Objective, check_choice, checked_column, stacked_
 from symgraph.optimizers.constrained import Constrained
 from symgraph.optimizers.lbfgs import Lbfgs
 from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
-from symgraph.optimizers.settings import number
+from symgraph.optimizers.settings import number, positive_whole
 from symgraph.plan import Plan, PlanRun
 from symgraph.plan_table import PlanRow
 from symgraph.progress import Progress
@@ -40,6 +40,7 @@ def solve(
     fixed: Mapping[str, Any] | None = None,
     seed: int = 0,
     time_limit: float | None = None,
+    threads: int = 1,
     progress: bool = True,
 ) -> Plan:
     """Find the actions and selections with the highest expected sum of rewards that meet all requirements.
@@ -58,6 +59,8 @@ def solve(
         fixed: {label: value} of actions and selections that are held.
         seed: of all that is random; the same seed gives the same plan, unless time runs out.
         time_limit: after which the best so far is returned [s]; building and compiling at first use come on top.
+        threads: that share the start points where J is compiled; plans are the same. More than one pays where a
+            gradient takes long, as with wide networks.
         progress: show a progress bar where it takes longer than two seconds.
 
     Raises:
@@ -73,6 +76,7 @@ def solve(
         raise InputError(f"seed = {seed!r}; give a whole number of at least 0")
     if time_limit is not None:
         number("time_limit", time_limit, "solve", 0.0)
+    positive_whole("threads", threads, "solve")
     held = {} if fixed is None else fixed
     begin = time.perf_counter()
     situation = objective.situation(state)
@@ -80,7 +84,7 @@ def solve(
     with Progress("planning", progress) as bar:
         if not situation.build.has_kernel:
             bar.wait("compiling")
-        problem = _problem(objective, situation, guess, held, bar, stop)
+        problem = _problem(objective, situation, guess, held, bar, stop, int(threads))
         bar.begin("planning")
         rng = np.random.default_rng(seed)
         selections = list(objective.graph.selections())
@@ -177,6 +181,7 @@ def _problem(
     fixed: Mapping[str, Any],
     progress: Progress,
     stop: Stop,
+    threads: int,
 ) -> Problem:
     low, high = (bound.copy() for bound in objective.bounds)
     selections = objective.graph.selections()
@@ -192,7 +197,7 @@ def _problem(
             check_choice(label, value, slot)
             allowed[label] = (slot.choices.index(value),)
     return Problem(
-        kernel=situation.bind(low, high, stop),
+        kernel=situation.bind(low, high, stop, threads),
         situation=situation,
         low=low,
         high=high,
@@ -280,9 +285,8 @@ def _names(objective: Objective, choices: Choices) -> dict[str, str]:
 
 def _why_not_finite(objective: Objective, situation: Situation, search: Search) -> str:
     """Say where the first start point stopped being finite."""
-    died = sum(run.outcome == "worker died" for run in search.runs)
-    if not search.runs or died == len(search.runs):
-        return f"no start point was finished: {search.status}; {died} runs were lost with their worker processes"
+    if not search.runs:
+        return f"no start point was finished: {search.status}"
     run = search.runs[0]
     selections = _names(objective, run.choices)
     at = f"at actions {objective.unstack(run.start)}, selections {selections}"

@@ -60,12 +60,13 @@ class Build:
     @cached_property
     def kernel(self) -> Kernel:
         """J and its gradient at many points, compiled where that is possible."""
-        return make_kernel(self.function, self._compiled)
+        return make_kernel(self.expectation.value_function(), lambda: self.function, self._compiled)
 
     @cached_property
     def merit_kernel(self) -> Kernel:
         """Likewise of the augmented Lagrangian, by which constraints are kept."""
-        return make_kernel(self.expectation.merit_and_gradient(), self._compiled)
+        expectation = self.expectation
+        return make_kernel(expectation.merit_function(), expectation.merit_and_gradient, self._compiled)
 
     def compile(self) -> None:
         """Make all that searches need."""
@@ -93,9 +94,9 @@ class Situation:
         parameters = self.build.expectation.inputs.parameters
         return [self.means, self.covariances, *(p.value.ravel(order="F") for p in parameters)]
 
-    def bind(self, low: Array, high: Array, stop: Stop = NEVER) -> BoundKernel:
+    def bind(self, low: Array, high: Array, stop: Stop = NEVER, threads: int = 1) -> BoundKernel:
         """Return the kernel of J at this state, for actions between bounds (n,); a stop ends searches early."""
-        return self.build.kernel.bind(self.shared, low, high, stop)
+        return self.build.kernel.bind(self.shared, low, high, stop, threads)
 
     def bind_merit(
         self, low: Array, high: Array, multipliers: Array, weights: Array, stop: Stop = NEVER

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 
 import casadi as ca
 
@@ -13,12 +14,18 @@ from symgraph.compile.toolchain import find_compiler
 from symgraph.errors import CompileError
 
 
-def make_kernel(function: ca.Function, compiled: bool) -> Kernel:
-    """Return the fastest kernel there is for a function: compiled if wanted and possible, else interpreted."""
+def make_kernel(value: ca.Function, with_gradient: Callable[[], ca.Function], compiled: bool) -> Kernel:
+    """Return the fastest kernel there is for a function: compiled if wanted and possible, else interpreted.
+
+    Args:
+        value: actions (n, 1), selections (m, 1) and further columns → value (1, 1).
+        with_gradient: makes the function that also returns the gradient (n, 1), for the interpreter.
+        compiled: compile it where there is a compiler.
+    """
     compiler = find_compiler() if compiled else None
     if compiler is not None:
         try:
-            return CompiledKernel(function, compiler)
+            return CompiledKernel(value, compiler)
         except CompileError as error:
             warnings.warn(f"{error}\nplans are computed in CasADi's interpreter instead", stacklevel=2)
-    return InterpretedKernel(function)
+    return InterpretedKernel(with_gradient())

@@ -1,216 +1,261 @@
-"""Kernels in C: CasADi's code for value and gradient, with the local search compiled around it."""
+"""Kernels in C: value and gradient of many points side by side, with the local search compiled around them."""
 
 from __future__ import annotations
 
 import ctypes
-import re
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import cache, cached_property
 from importlib import resources
+from itertools import pairwise
+from time import perf_counter
 from typing import Any, get_args
 
 import casadi as ca
 import numpy as np
 
 from symgraph.compile.kernel import NEVER, AdadeltaSteps, BoundKernel, Ended, Kernel, Outcome, Stop
+from symgraph.compile.rules import adjoints
+from symgraph.compile.source import kernel_source
 from symgraph.compile.toolchain import load
-from symgraph.errors import CompileError
-from symgraph.slots import Array
+from symgraph.slots import Array, Choices
 
-# The point-by-point call of CasADi's function, between that and search.c.
-_HEAD = """
-#define N_ACTIONS {n_actions}
-struct inputs {{ const double *selections; const double *const *shared; const volatile int *stop; double *w; }};
-static int evaluate(const double *x, const struct inputs *in, double *value, double *gradient) {{
-  const double *arg[{arguments}];
-  double *res[{results}];
-  casadi_int iw[{integers}];
-  int i;
-  arg[0] = x;
-  arg[1] = in->selections;
-  for (i = 0; i < {n_shared}; ++i) arg[2 + i] = in->shared[i];
-  res[0] = value;
-  res[1] = gradient;
-  return {name}(arg, res, iw, in->w, 0);
-}}
-"""
-
-# What Python calls, after search.c. Workspace: first CasADi's, then the search's.
-_TAIL = """
-void symgraph_evaluate(long long points, const double *actions, const double *selections, const double *const *shared,
-                       const int *stop, double *values, double *gradients, double *w) {{
-  struct inputs in;
-  long long p;
-  in.shared = shared;
-  in.stop = stop;
-  in.w = w;
-  for (p = 0; p < points; ++p) {{
-    in.selections = selections + p * {n_selections};
-    if ((p && *in.stop) || evaluate(actions + p * N_ACTIONS, &in, values + p, gradients + p * N_ACTIONS))
-      values[p] = NAN;
-  }}
-}}
-long long symgraph_climb(double *x, const double *selection, const double *const *shared, const int *stop,
-                         const double *low, const double *high, long long iterations, double tolerance,
-                         double *value, int *outcome, double *history, double *w) {{
-  struct inputs in;
-  in.selections = selection;
-  in.shared = shared;
-  in.stop = stop;
-  in.w = w;
-  return climb(x, &in, low, high, iterations, tolerance, value, outcome, history, w + {work});
-}}
-long long symgraph_ascend(double *x, const double *selection, const double *const *shared, const int *stop,
-                          const double *low, const double *high, long long limit, double decay, double epsilon,
-                          double tolerance, double scale, int oscillation, int scaled, int keep_best,
-                          double *value, int *outcome, double *history, double *w) {{
-  struct inputs in;
-  in.selections = selection;
-  in.shared = shared;
-  in.stop = stop;
-  in.w = w;
-  return ascend(x, &in, low, high, limit, decay, epsilon, tolerance, scale, oscillation, scaled, keep_best, value,
-                outcome, history, w + {work});
-}}
-int symgraph_work(void) {{ return {work} + SEARCH_WORK; }}
-"""
+SLICE = 0.05  # seconds of a search between two looks at what the user wants
+ALIGNMENT = 64  # bytes: a cache line, and the longest vector
+HEAVY = 256  # weights from which on single points have a kernel of their own
 
 _OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)  # in the order of search.c's enum
+_UNDER_WAY = -1
 
 
 class CompiledKernel(Kernel):
     """A kernel as machine code.
 
+    Args:
+        function: actions (n, 1), selections (m, 1) and what is bound → value (1, 1).
+        compiler: the path of a C compiler.
+        single: compute in single precision.
+
     Raises:
         CompileError: the compiler refused the code.
     """
 
-    def __init__(self, function: ca.Function, compiler: str) -> None:
-        generator = ca.CodeGenerator("kernel", {"with_header": False, "include_math": False})
-        generator.add(function)
-        sizes = {
-            "name": function.name(),
-            "arguments": function.sz_arg(),
-            "results": function.sz_res(),
-            "integers": max(1, function.sz_iw()),
-            "n_actions": function.numel_in(0),
-            "n_selections": function.numel_in(1),
-            "n_shared": function.n_in() - 2,
-            "work": function.sz_w(),
-        }
-        function_code = _text("extrema.c") + _with_fast_products(generator.dump())
-        self._source = function_code + _HEAD.format(**sizes) + _text("search.c") + _TAIL.format(**sizes)
+    def __init__(self, function: ca.Function, compiler: str, single: bool = False) -> None:
+        self.function = function
+        self.single = single
         self._compiler = compiler
         self.n_actions, self.n_selections = function.numel_in(0), function.numel_in(1)
-        self._load()
+        # A point alone leaves most of a vector empty, which matters where there are matrices of weights.
+        self._heavy = any(function.numel_in(i) >= HEAVY for i in range(2, function.n_in()))
+        self.wide  # noqa: B018 compiled here, where errors are expected
 
-    def _load(self) -> None:
-        library = load(self._source, self._compiler)
+    @cached_property
+    def wide(self) -> Library:
+        """For points side by side."""
+        return Library(self.function, self._compiler, lanes=True, single=self.single)
+
+    @cached_property
+    def narrow(self) -> Library:
+        """For points one at a time."""
+        return Library(self.function, self._compiler, lanes=False, single=self.single) if self._heavy else self.wide
+
+    def library(self, count: int) -> Library:
+        """Return the code that is best for so many points."""
+        return self.narrow if count == 1 else self.wide
+
+    def __reduce__(self) -> tuple[Any, ...]:  # other processes load the libraries from the cache
+        return CompiledKernel, (self.function, self._compiler, self.single)
+
+    def bind(
+        self, shared: Sequence[Array], low: Array, high: Array, stop: Stop = NEVER, threads: int = 1
+    ) -> BoundKernel:
+        columns = [contiguous(column) for column in shared]
+        return _BoundCompiled(self, columns, contiguous(low), contiguous(high), stop, threads)
+
+
+class Library:
+    """The functions of kernel.c for one function, compiled."""
+
+    def __init__(self, function: ca.Function, compiler: str, lanes: bool, single: bool) -> None:
+        key = hashlib.sha256(function.serialize().encode())
+        for part in (*_engine(), *(adjoint.serialize() for adjoint in adjoints()), repr((lanes, single))):
+            key.update(part.encode())
+        code: Any = load(key.hexdigest(), lambda: kernel_source(function, lanes, single), compiler)
         pointer: Any = ctypes.c_void_p
         whole: Any = ctypes.c_longlong
-        number: Any = ctypes.c_double
-        library.symgraph_evaluate.argtypes = [whole, *[pointer] * 7]
-        library.symgraph_evaluate.restype = None
-        library.symgraph_climb.argtypes = [*[pointer] * 6, whole, number, *[pointer] * 4]
-        library.symgraph_climb.restype = whole
-        steps = [whole, *[number] * 4, ctypes.c_int, ctypes.c_int, ctypes.c_int]
-        library.symgraph_ascend.argtypes = [*[pointer] * 6, *steps, *[pointer] * 4]
-        library.symgraph_ascend.restype = whole
-        self.code: Any = library
-        self.work = int(library.symgraph_work())
+        code.symgraph_sizes.argtypes = [pointer]
+        code.symgraph_bind.argtypes = [pointer] * 3
+        code.symgraph_evaluate.argtypes = [whole, *[pointer] * 7]
+        code.symgraph_begin.argtypes = [pointer, pointer, pointer, whole, whole, *[pointer] * 9]
+        code.symgraph_advance.argtypes = [pointer, pointer, pointer, whole]
+        for name in ("sizes", "bind", "evaluate", "begin", "advance"):
+            getattr(code, f"symgraph_{name}").restype = None
+        self.code = code
+        self.real = np.dtype(np.float32 if single else np.float64)
+        sizes = (ctypes.c_longlong * 4)()
+        code.symgraph_sizes(sizes)
+        self.block, self.early_work, self.work, self.search_bytes = sizes
 
-    def __getstate__(self) -> dict[str, Any]:  # other processes load the library from the cache
-        return {name: value for name, value in self.__dict__.items() if name not in ("code", "work")}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._load()
+class _Settings(ctypes.Structure):
+    """`struct settings` of search.c."""
 
-    def bind(self, shared: Sequence[Array], low: Array, high: Array, stop: Stop = NEVER) -> BoundKernel:
-        columns = [contiguous(column) for column in shared]
-        return _BoundCompiled(self, columns, contiguous(low), contiguous(high), stop)
+    _fields_ = (
+        ("low", ctypes.c_void_p),
+        ("high", ctypes.c_void_p),
+        ("limit", ctypes.c_longlong),
+        ("ascends", ctypes.c_int),
+        ("decay", ctypes.c_double),
+        ("epsilon", ctypes.c_double),
+        ("oscillation", ctypes.c_int),
+        ("scaled", ctypes.c_int),
+        ("keep_best", ctypes.c_int),
+        ("stop", ctypes.c_void_p),
+    )
+
+
+class _Inputs:
+    """Bound inputs of a library, what follows from them, and workspace for each thread."""
+
+    def __init__(self, library: Library, shared: Sequence[Array], threads: int) -> None:
+        self.library = library
+        block = aligned(library.block, library.real)
+        self._kept = [*(np.ascontiguousarray(column, dtype=library.real) for column in shared), block]
+        self._pointers = (ctypes.c_void_p * len(self._kept))(*[address(column) for column in self._kept])
+        self.shared = ctypes.addressof(self._pointers)
+        library.code.symgraph_bind(self.shared, address(block), address(aligned(library.early_work, library.real)))
+        self._workspaces = [aligned(library.work, library.real) for _ in range(threads)]
+        self.work = [address(workspace) for workspace in self._workspaces]
 
 
 class _BoundCompiled(BoundKernel):
-    """Hands arrays of its own to the library, since looking up an array's address costs as much as ten gradients."""
-
-    def __init__(self, kernel: CompiledKernel, shared: list[Array], low: Array, high: Array, stop: Stop) -> None:
+    def __init__(
+        self, kernel: CompiledKernel, shared: list[Array], low: Array, high: Array, stop: Stop, threads: int
+    ) -> None:
         self._kernel = kernel
-        self._inputs = shared, low, high, stop
-        self._pointers = (ctypes.c_void_p * max(1, len(shared)))(*[_address(column) for column in shared])
-        self._work = np.empty(kernel.work)
-        self._point, self._selection = np.zeros(kernel.n_actions), np.zeros(kernel.n_selections)
-        self._value, self._outcome = ctypes.c_double(), ctypes.c_int()
-        self._history = np.empty(0)
-        self._before = (
-            _address(self._point),
-            _address(self._selection),
-            ctypes.addressof(self._pointers),
-            stop.address,
-            _address(low),
-            _address(high),
-        )
+        self._given = shared, low, high, stop
+        self._threads = threads
+        self._inputs: dict[int, _Inputs] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _BoundCompiled, (self._kernel, *self._inputs)
+        return _BoundCompiled, (self._kernel, *self._given, self._threads)
+
+    def _for(self, count: int) -> _Inputs:
+        library = self._kernel.library(count)
+        if id(library) not in self._inputs:
+            self._inputs[id(library)] = _Inputs(library, self._given[0], self._threads)
+        return self._inputs[id(library)]
 
     def evaluate(self, actions: Array, selections: Array) -> tuple[Array, Array]:
-        actions, selections = contiguous(actions), contiguous(selections)
-        values, gradients = np.empty(len(actions)), np.empty(actions.shape)
-        self._kernel.code.symgraph_evaluate(
-            len(actions),
-            _address(actions),
-            _address(selections),
-            ctypes.addressof(self._pointers),
-            self._inputs[3].address,
-            _address(values),
-            _address(gradients),
-            _address(self._work),
+        order = _by_selection(selections)
+        points, chosen = contiguous(actions), contiguous(selections)
+        if order is not None:
+            points, chosen = points[order], chosen[order]
+        inputs, stop = self._for(len(points)), self._given[3].address
+        values, gradients = np.empty(len(points)), np.empty(points.shape)
+        edges = np.linspace(0, len(points), self._threads + 1).astype(int).tolist()
+        parts = [[array[a:b] for array in (points, chosen, values, gradients)] for a, b in pairwise(edges) if b > a]
+
+        def work(part: list[Array], workspace: int) -> None:
+            x, h, v, g = map(address, part)
+            inputs.library.code.symgraph_evaluate(len(part[0]), x, h, inputs.shared, stop, v, g, workspace)
+
+        _side_by_side(work, list(zip(parts, inputs.work, strict=False)))
+        if order is None:
+            return values, gradients
+        in_turn = np.empty_like(values), np.empty_like(gradients)
+        in_turn[0][order], in_turn[1][order] = values, gradients
+        return in_turn
+
+    def climb(
+        self, starts: Array, selections: Array, iterations: int, tolerances: Array
+    ) -> Iterator[tuple[int, Ended]]:
+        return self._search(starts, selections, tolerances, np.ones(len(starts)), limit=iterations)
+
+    def ascend(
+        self, starts: Array, selections: Array, limit: int, steps: AdadeltaSteps, scales: Array
+    ) -> Iterator[tuple[int, Ended]]:
+        return self._search(
+            starts,
+            selections,
+            steps.tolerance * scales,
+            scales,
+            limit=limit + 1,
+            ascends=True,
+            decay=steps.decay,
+            epsilon=steps.epsilon,
+            oscillation=steps.oscillation,
+            scaled=steps.scaled,
+            keep_best=steps.keep_best,
         )
-        return values, gradients
 
-    def climb(self, start: Array, selection: Array, iterations: int, tolerance: float) -> Ended:
-        function = self._kernel.code.symgraph_climb
-        return self._search(function, start, selection, iterations, (iterations, tolerance))
+    def _search(
+        self, starts: Array, selections: Array, tolerances: Array, scales: Array, **settings: float
+    ) -> Iterator[tuple[int, Ended]]:
+        """Search from all starts, some time at once, and hand out those that have ended in between."""
+        _, low, high, stop = self._given
+        count = len(starts)
+        order = _by_selection(selections)
+        order = np.arange(count) if order is None else order
+        inputs = self._for(count)
+        code = inputs.library.code
+        given = [contiguous(column[order]) for column in (starts, selections, tolerances, scales)]
+        ends, values, histories = np.empty(starts.shape), np.empty(count), np.empty((count, int(settings["limit"])))
+        outcomes, spent = np.full(count, _UNDER_WAY, dtype=np.intc), np.zeros(count, dtype=np.longlong)
+        pointers = [address(column) for column in (*given, ends, values, histories, outcomes, spent)]
+        all_settings = _Settings(low=address(low), high=address(high), stop=stop.address, **settings)
+        following = ctypes.c_long(0)  # the first start that waits, for all threads
+        searches = [np.empty(inputs.library.search_bytes, dtype=np.uint8) for _ in inputs.work]
+        for search in searches:
+            shares = address(search), ctypes.addressof(all_settings), ctypes.addressof(following), len(searches)
+            code.symgraph_begin(*shares, count, *pointers)
 
-    def ascend(self, start: Array, selection: Array, limit: int, steps: AdadeltaSteps) -> Ended:
-        numbers = steps.decay, steps.epsilon, steps.tolerance, steps.scale
-        settings = (limit, *numbers, steps.oscillation, steps.scaled, steps.keep_best)
-        return self._search(self._kernel.code.symgraph_ascend, start, selection, limit + 1, settings)
+        def work(search: Array, workspace: int) -> None:
+            code.symgraph_advance(address(search), inputs.shared, workspace, rounds)
 
-    def _search(self, function: Any, start: Array, selection: Array, length: int, settings: tuple[Any, ...]) -> Ended:
-        if self._history.size < length:
-            self._history = np.empty(length)
-            self._after = (
-                ctypes.addressof(self._value),
-                ctypes.addressof(self._outcome),
-                _address(self._history),
-                _address(self._work),
-            )
-        self._point[:] = start
-        self._selection[:] = selection
-        spent = function(*self._before, *settings, *self._after)
-        outcome = _OUTCOMES[self._outcome.value]
-        return Ended(self._point.copy(), self._value.value, outcome, self._history[:spent].copy())
-
-
-def _with_fast_products(source: str) -> str:
-    """Put the products of matrices.c in place of CasADi's, where there are any."""
-    call = "casadi_mtimes_dense("
-    if call not in source:
-        return source
-    products = _text("matrices.c")
-    theirs = re.compile(r"void casadi_mtimes_dense\([^)]*\) \{\n.*?\n\}\n", re.DOTALL)
-    replaced, times = theirs.subn(lambda _: products, source)
-    if times != 1:
-        raise CompileError(
-            f"CasADi {ca.CasadiMeta.version()} writes {call}…) in another form than is known; please report it"
-        )
-    return replaced
+        rounds, waiting, over = 1, np.ones(count, dtype=bool), False
+        while waiting.any() and not over:
+            begin = perf_counter()
+            over = bool(stop) and not waiting.all()  # one last round, in which walks that are under way end
+            rounds = 1 if over else rounds
+            _side_by_side(work, list(zip(searches, inputs.work, strict=True)))
+            rounds = max(1, min(2 * rounds, int(rounds * SLICE / max(perf_counter() - begin, 1e-9))))
+            for p in np.flatnonzero(waiting & (outcomes != _UNDER_WAY)):
+                waiting[p] = False
+                outcome, history = _OUTCOMES[outcomes[p]], histories[p, : spent[p]].copy()
+                yield int(order[p]), Ended(ends[p].copy(), float(values[p]), outcome, history)
 
 
-def _text(name: str) -> str:
-    """Return a C file of this package."""
-    return (resources.files("symgraph.compile") / name).read_text()
+def _side_by_side(work: Callable[..., None], arguments: list[tuple[Any, ...]]) -> None:
+    """Call a function with each of several arguments, in threads of their own; return when all are done."""
+    futures = [_pool(len(arguments)).submit(work, *given) for given in arguments[1:]]
+    try:
+        work(*arguments[0])
+    finally:  # even where the user interrupts: arrays must stay until nobody writes to them
+        wait(futures)
+    for future in futures:
+        future.result()
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="symgraph")
+
+
+def _by_selection(selections: Array) -> Choices | None:
+    """Return an order in which equal rows stand together; None where they do already."""
+    if len(selections) <= 1 or selections.shape[1] == 0 or (selections == selections[0]).all():
+        return None
+    return np.lexsort(selections.T)
+
+
+@cache
+def _engine() -> tuple[str, ...]:
+    """Return all that decides what a function becomes: the files of this package."""
+    folder = resources.files("symgraph.compile")
+    files = sorted((file.name, file.read_text()) for file in folder.iterdir() if file.name.endswith((".py", ".c")))
+    return tuple(text for _, text in files)
 
 
 def contiguous(column: Array) -> Array:
@@ -218,5 +263,13 @@ def contiguous(column: Array) -> Array:
     return np.ascontiguousarray(column, dtype=float)
 
 
-def _address(column: Array) -> int:
+def aligned(count: int, real: np.dtype[Any]) -> Array:
+    """Return numbers that begin where a cache line does."""
+    memory = np.empty(max(1, count) * real.itemsize + ALIGNMENT, dtype=np.uint8)
+    begin = -address(memory) % ALIGNMENT
+    return memory[begin : begin + max(1, count) * real.itemsize].view(real)
+
+
+def address(column: Any) -> int:
+    """Return where an array's numbers are."""
     return int(column.__array_interface__["data"][0])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
 import casadi as ca
@@ -61,7 +61,9 @@ class InterpretedKernel(Kernel):
     def __init__(self, function: ca.Function) -> None:
         self.function = FlatFunction(function)
 
-    def bind(self, shared: Sequence[Array], low: Array, high: Array, stop: Stop = NEVER) -> BoundKernel:
+    def bind(
+        self, shared: Sequence[Array], low: Array, high: Array, stop: Stop = NEVER, threads: int = 1
+    ) -> BoundKernel:
         return _BoundInterpreted(self.function, list(shared), low, high, stop)
 
 
@@ -81,7 +83,23 @@ class _BoundInterpreted(BoundKernel):
             values[p], gradients[p] = self._at(actions[p], selections[p])
         return values, gradients
 
-    def climb(self, start: Array, selection: Array, iterations: int, tolerance: float) -> Ended:
+    def climb(
+        self, starts: Array, selections: Array, iterations: int, tolerances: Array
+    ) -> Iterator[tuple[int, Ended]]:
+        for p in range(len(starts)):
+            if p and self._stop:
+                return
+            yield p, self._climb(starts[p], selections[p], iterations, float(tolerances[p]))
+
+    def ascend(
+        self, starts: Array, selections: Array, limit: int, steps: AdadeltaSteps, scales: Array
+    ) -> Iterator[tuple[int, Ended]]:
+        for p in range(len(starts)):
+            if p and self._stop:
+                return
+            yield p, self._ascend(starts[p], selections[p], limit, steps, float(scales[p]))
+
+    def _climb(self, start: Array, selection: Array, iterations: int, tolerance: float) -> Ended:
         def place(u: Array) -> Array:
             return np.clip(self._low + span * u, self._low, self._high)  # rounding must not carry it past a bound
 
@@ -169,7 +187,7 @@ class _BoundInterpreted(BoundKernel):
                 break
         return Ended(place(u), -f, cast(Outcome, outcome), np.array(history))
 
-    def ascend(self, start: Array, selection: Array, limit: int, steps: AdadeltaSteps) -> Ended:
+    def _ascend(self, start: Array, selection: Array, limit: int, steps: AdadeltaSteps, scale: float) -> Ended:
         x, low, high = start.copy(), self._low, self._high
         span = high - low if steps.scaled else np.ones_like(low)
         value, gradient = self._at(x, selection)
@@ -184,7 +202,7 @@ class _BoundInterpreted(BoundKernel):
                 outcome = "time limit"
                 break
             before, last = value, x
-            slope = gradient * span / steps.scale
+            slope = gradient * span / scale
             v = steps.decay * v + (1.0 - steps.decay) * slope * slope
             delta = slope * np.sqrt((w + steps.epsilon) / (v + steps.epsilon))
             w = steps.decay * w + (1.0 - steps.decay) * delta * delta
@@ -197,7 +215,7 @@ class _BoundInterpreted(BoundKernel):
             history.append(value)
             if value > best_value:
                 best, best_value = x, value
-            if 0.0 <= value - before < steps.tolerance:
+            if 0.0 <= value - before < steps.tolerance * scale:
                 outcome = "converged"
                 break
             falls += value < before

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import ctypes
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from symgraph.slots import Array
 
-Outcome = Literal[
-    "converged", "iteration limit", "oscillation", "stalled", "not finite", "time limit", "worker died", "drawn"
-]
+Outcome = Literal["converged", "iteration limit", "oscillation", "stalled", "not finite", "time limit", "drawn"]
 
 
 class Stop:
@@ -50,8 +48,7 @@ class AdadeltaSteps:
 
     decay: float
     epsilon: float
-    tolerance: float
-    scale: float  # size of J, which gradients are divided by [reward]
+    tolerance: float  # of the size of J
     oscillation: int
     scaled: bool
     keep_best: bool
@@ -90,21 +87,37 @@ class BoundKernel(ABC):
         """
 
     @abstractmethod
-    def climb(self, start: Array, selection: Array, iterations: int, tolerance: float) -> Ended:
-        """Climb from one point to a local maximum within the bounds by L-BFGS.
+    def climb(
+        self, starts: Array, selections: Array, iterations: int, tolerances: Array
+    ) -> Iterator[tuple[int, Ended]]:
+        """Climb from points to local maxima within the bounds by L-BFGS.
 
         Args:
-            start: (n,) actions.
-            selection: (m,) one-hot.
-            iterations: gradients at most.
-            tolerance: largest element of the projected gradient over (x − low)/(high − low) that is converged [reward].
+            starts: (P, n) actions.
+            selections: (P, m) one-hot rows.
+            iterations: gradients of one climb at most.
+            tolerances: (P,) largest element of the projected gradient over (x − low)/(high − low) that is converged
+                [reward].
+
+        Yields:
+            the number of a start and where its climb ended, as soon as it has; once a stop is set, not all may come.
         """
 
     @abstractmethod
-    def ascend(self, start: Array, selection: Array, limit: int, steps: AdadeltaSteps) -> Ended:
-        """Move one point by ADADELTA for at most `limit` steps.
+    def ascend(
+        self, starts: Array, selections: Array, limit: int, steps: AdadeltaSteps, scales: Array
+    ) -> Iterator[tuple[int, Ended]]:
+        """Move points by ADADELTA for at most `limit` steps each; the rest as for `climb`.
 
-        On gradient g:  v ← ρv + (1 − ρ)g²,  Δ = g √(w + ε)/√(v + ε),  w ← ρw + (1 − ρ)Δ²,  x ← clip(x + Δ).
+        On gradient g over the scale:  v ← ρv + (1 − ρ)g²,  Δ = g √(w + ε)/√(v + ε),  w ← ρw + (1 − ρ)Δ²,
+        x ← clip(x + Δ).
+
+        Args:
+            starts: (P, n) actions.
+            selections: (P, m) one-hot rows.
+            limit: steps.
+            steps: settings.
+            scales: (P,) sizes of J [reward].
 
         Source: Zeiler, arXiv:1212.5701, algorithm 1, with the sign of ascent.
         """
@@ -114,7 +127,9 @@ class Kernel(ABC):
     """Value (1, 1) and gradient (n, 1) as a function of actions (n, 1), selections (m, 1) and further columns."""
 
     @abstractmethod
-    def bind(self, shared: Sequence[Array], low: Array, high: Array, stop: Stop = NEVER) -> BoundKernel:
+    def bind(
+        self, shared: Sequence[Array], low: Array, high: Array, stop: Stop = NEVER, threads: int = 1
+    ) -> BoundKernel:
         """Put in what a search does not change.
 
         Args:
@@ -122,4 +137,5 @@ class Kernel(ABC):
             low: (n,) lower bounds of the actions.
             high: (n,) upper bounds; an action with low = high is held there.
             stop: ends a search, and an evaluation of many points, after at least one gradient.
+            threads: that share the points of one call, where that is possible.
         """

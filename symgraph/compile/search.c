@@ -1,17 +1,24 @@
-/* Local search from one point, next to the gradient: projected L-BFGS and ADADELTA.
+/* Local search from many points side by side, next to the gradient: projected L-BFGS and ADADELTA.
 
-   C99, libm only, no allocation, no globals. The file that includes this one defines
-     N_ACTIONS                  number of stacked actions
-     struct inputs              what evaluate() needs besides the actions, and `stop`: not 0 once time is over
-     int evaluate(const double *x, const struct inputs *in, double *value, double *gradient)
-                                returns 0, or 1 where the model failed
-   interpreted.py does the same, step for step, where there is no compiler: change both.
+   C99 but for atomic operations, libm only, no allocation, no globals. The file that includes this one defines
+     N_ACTIONS, N_SELECTIONS    numbers of stacked actions, and of choices
+     MOST_LANES                 points that are evaluated side by side
+     fill, evaluate             how many lanes are worked on for so many points; values and gradients of B lanes
+   Each point has a walk that says where it wants to be evaluated next; when one has ended, the next point takes its place.
+   interpreted.py does the same for one point, step for step, where there is no compiler: change both.
    Bounds are low[N_ACTIONS], high[N_ACTIONS]; an action with low == high is held. */
 
-enum outcome { CONVERGED, ITERATION_LIMIT, OSCILLATION, STALLED, NOT_FINITE, TIME_LIMIT };
+/* Numbers of B lanes side by side: x (N_ACTIONS, B), chosen (N_SELECTIONS, B), value (B), gradient (N_ACTIONS, B). */
+struct lanes {
+  real *x, *chosen, *value, *gradient;
+  const void *given; /* what evaluate needs besides */
+};
+static int fill(long count);
+static void evaluate(const struct lanes *lanes, long B);
+
+enum outcome { UNDER_WAY = -1, CONVERGED, ITERATION_LIMIT, OSCILLATION, STALLED, NOT_FINITE, TIME_LIMIT };
 
 #define PAIRS (N_ACTIONS < 8 ? (N_ACTIONS > 0 ? N_ACTIONS : 1) : 8) /* curvature pairs that L-BFGS keeps */
-#define SEARCH_WORK (2 * PAIRS * N_ACTIONS + 11 * N_ACTIONS + 1)          /* doubles of workspace */
 
 static const double FIRST_STEP = 0.05;     /* [range] no curvature is known yet */
 static const double LONGEST_STEP = 0.5;    /* [range] no step crosses more than half of it */
@@ -38,32 +45,20 @@ static double dot(const double *a, const double *b, const double *mask) {
   return sum;
 }
 
+static double larger(double a, double b) { return a > b ? a : b; }
+static double smaller(double a, double b) { return a < b ? a : b; }
+
 static double largest(const double *a) {
   double found = 0;
   int i;
-  for (i = 0; i < N_ACTIONS; ++i) found = fmax(found, fabs(a[i]));
+  for (i = 0; i < N_ACTIONS; ++i) found = larger(found, fabs(a[i]));
   return found;
 }
 
 /* x = low + (high - low) u, which rounding must not carry past a bound. */
 static void place(const double *u, const double *low, const double *high, double *x) {
   int i;
-  for (i = 0; i < N_ACTIONS; ++i) x[i] = fmin(fmax(low[i] + (high[i] - low[i]) * u[i], low[i]), high[i]);
-}
-
-/* f = -J and its gradient over u = (x - low) / (high - low); returns whether all is finite. */
-static int descend_value(const double *u, const struct inputs *in, const double *low, const double *high, double *x,
-                         double *f, double *g) {
-  double value = 0, check = 0;
-  int i;
-  place(u, low, high, x);
-  if (evaluate(x, in, &value, g)) return 0;
-  for (i = 0; i < N_ACTIONS; ++i) {
-    g[i] *= -(high[i] - low[i]);
-    check += g[i];
-  }
-  *f = -value;
-  return isfinite(value) && isfinite(check);
+  for (i = 0; i < N_ACTIONS; ++i) x[i] = smaller(larger(low[i] + (high[i] - low[i]) * u[i], low[i]), high[i]);
 }
 
 /* d = -H g within the actions of the mask, by the two-loop recursion over the curvature pairs, newest first (Nocedal &
@@ -120,213 +115,320 @@ static double direction(const struct pairs *pairs, const double *u, const double
   return slope;
 }
 
-/* Climb from x to a local maximum within the bounds by projected L-BFGS (Liu & Nocedal 1989). The line search brackets a
-   step that satisfies the weak Wolfe conditions, with which BFGS also gets past kinks (Lewis & Overton 2013).
-   history takes up to `iterations` values, one for each gradient; returns their number. */
-static long long climb(double *x, const struct inputs *in, const double *low, const double *high, long long iterations,
-                       double tolerance, double *value, int *outcome, double *history, double *work) {
-  struct pairs pairs = {work, work + PAIRS * N_ACTIONS, 0, -1};
-  double *u = work + 2 * PAIRS * N_ACTIONS, *g = u + N_ACTIONS, *d = g + N_ACTIONS, *trial = d + N_ACTIONS, *g_trial = trial + N_ACTIONS;
-  double *u_low = g_trial + N_ACTIONS, *g_low = u_low + N_ACTIONS, *mask = g_low + N_ACTIONS, *step = mask + N_ACTIONS;
-  double *change = step + N_ACTIONS, *free = change + N_ACTIONS;
-  double f = 0, f_low = 0, f_trial = 0, descent = 0, longest = 0, slope = 0;
-  double t = 1, t_low = 0, t_high = INFINITY; /* steps between which the line search looks */
-  long long spent = 1;
-  int i, fresh = 1, flat = 0, tries = 0, doubted = 0;
+/* What all walks of a search share. */
+struct settings {
+  const double *low, *high;
+  long long limit;    /* gradients of one walk */
+  int ascends;        /* by ADADELTA, else L-BFGS */
+  double decay, epsilon;
+  int oscillation, scaled, keep_best;
+  const volatile int *stop; /* not 0 once time is over */
+};
 
-  for (i = 0; i < N_ACTIONS; ++i) u[i] = high[i] > low[i] ? fmin(fmax((x[i] - low[i]) / (high[i] - low[i]), 0), 1) : 0;
-  if (!descend_value(u, in, low, high, x, &f, g)) {
-    *value = history[0] = -INFINITY;
-    *outcome = NOT_FINITE;
-    return 1;
+/* One point on its way. */
+struct walk {
+  long start; /* its number */
+  double tolerance, scale;
+  double *history;
+  long long spent, limit;
+  int begun, outcome;
+  double value;
+  double x[N_ACTIONS + 1]; /* where it wants to be evaluated; at the end, where it has ended */
+  /* of L-BFGS, which minimises f = -J over u = (x - low) / (high - low) */
+  struct pairs pairs;
+  double s[PAIRS * N_ACTIONS + 1], y[PAIRS * N_ACTIONS + 1];
+  double u[N_ACTIONS + 1], g[N_ACTIONS + 1], d[N_ACTIONS + 1], trial[N_ACTIONS + 1], u_low[N_ACTIONS + 1], g_low[N_ACTIONS + 1];
+  double f, f_low, descent, longest, slope, predicted;
+  double t, t_low, t_high; /* steps between which the line search looks */
+  int fresh, flat, tries, doubted;
+  /* of ADADELTA, of which u is the last point, g the gradient there */
+  double mean_square[N_ACTIONS + 1], mean_move[N_ACTIONS + 1], best[N_ACTIONS + 1], best_value;
+  int falls;
+  double scratch[3][N_ACTIONS + 1]; /* here, since the stack may be small */
+};
+
+/* Take the best step of the line search. */
+static void accept(struct walk *k, double noise) {
+  double *const step = k->scratch[0], *const change = k->scratch[1], sy = 0, ss = 0, yy = 0;
+  int i;
+  for (i = 0; i < N_ACTIONS; ++i) {
+    step[i] = k->u_low[i] - k->u[i];
+    change[i] = k->g_low[i] - k->g[i];
+    sy += step[i] * change[i];
+    ss += step[i] * step[i];
+    yy += change[i] * change[i];
   }
-  history[0] = -f;
-  *outcome = ITERATION_LIMIT;
-  for (;;) {
-    double predicted = 0, slope_trial = 0, noise = SMALLEST_GAIN * fabs(f);
-    int finite, gained, accepted = 0;
-    if (*in->stop) {
-      iterations = spent;
-      *outcome = TIME_LIMIT;
+  if (sy > 1e-12 * sqrt(ss * yy)) {
+    k->pairs.newest = (k->pairs.newest + 1) % PAIRS;
+    if (k->pairs.stored < PAIRS) ++k->pairs.stored;
+    for (i = 0; i < N_ACTIONS; ++i) {
+      k->pairs.s[nth(&k->pairs, 0) + i] = step[i];
+      k->pairs.y[nth(&k->pairs, 0) + i] = change[i];
     }
-    if (fresh) {
-      slope = 0;
-      for (i = 0; i < N_ACTIONS; ++i) {
-        int held = high[i] <= low[i] || (u[i] <= 0 && g[i] > 0) || (u[i] >= 1 && g[i] < 0);
-        mask[i] = held ? 0 : 1;
-        slope = fmax(slope, mask[i] * fabs(g[i]));
-      }
-      if (slope <= tolerance) {
-        *outcome = CONVERGED;
-        break;
-      }
-      for (i = 0; i < N_ACTIONS; ++i) free[i] = mask[i];
-      descent = direction(&pairs, u, g, mask, d, change);
-      if (pairs.stored == 0 || !(descent < 0)) { /* nothing known of the curvature: along the gradient */
-        descent = 0;
-        for (i = 0; i < N_ACTIONS; ++i) {
-          d[i] = -free[i] * g[i] * (FIRST_STEP / slope);
-          descent += g[i] * d[i];
-        }
-      }
-      longest = largest(d);
-      t = longest > LONGEST_STEP ? LONGEST_STEP / longest : 1;
-      t_low = 0;
-      t_high = INFINITY;
-      tries = 0;
-      fresh = 0;
-    }
-    if (spent >= iterations) {
-      accepted = t_low > 0;
-    } else {
-      for (i = 0; i < N_ACTIONS; ++i) {
-        trial[i] = fmin(fmax(u[i] + t * d[i], 0), 1);
-        step[i] = trial[i] - u[i];
-        predicted += g[i] * step[i];
-      }
-      finite = descend_value(trial, in, low, high, x, &f_trial, g_trial);
-      gained = finite && predicted < 0 && f_trial <= f + ARMIJO * predicted + noise;
-      for (i = 0; i < N_ACTIONS; ++i)
-        if (trial[i] > 0 && trial[i] < 1) slope_trial += g_trial[i] * d[i];
-      ++tries;
-      if (gained) { /* the best step so far, if not yet a good one */
-        t_low = t;
-        f_low = f_trial;
-        for (i = 0; i < N_ACTIONS; ++i) {
-          u_low[i] = trial[i];
-          g_low[i] = g_trial[i];
-        }
-        accepted = slope_trial >= CURVATURE * descent || f - f_trial <= noise || tries > MOST_TRIES ||
-                   (isinf(t_high) && t * longest >= LONGEST_STEP);
-        t = isinf(t_high) ? fmin(4 * t, LONGEST_STEP / longest) : (t_low + t_high) / 2;
-      } else {
-        t_high = t;
-        if (t_low > 0) {
-          t = (t_low + t_high) / 2;
-        } else { /* the minimum of the parabola through f, its slope and the new value, within a tenth to a half */
-          double rise = f_trial - f - predicted;
-          double shrink = finite && rise > 0 ? -predicted / (2 * rise) : 0.1;
-          t *= fmin(fmax(shrink, 0.1), 0.5);
-        }
-        if (tries > MOST_TRIES || largest(step) <= 1e-16) {
-          accepted = t_low > 0;
-          if (!accepted) {
-            /* No step gains any more. If the curvature pairs are to blame, the gradient alone will still gain. */
-            if (pairs.stored == 0) *outcome = doubted || slope <= LOOSE * tolerance ? CONVERGED : STALLED;
-            fresh = 1;
-          }
-        }
-      }
-    }
-    if (accepted) {
-      double sy = 0, ss = 0, yy = 0;
-      for (i = 0; i < N_ACTIONS; ++i) {
-        step[i] = u_low[i] - u[i];
-        change[i] = g_low[i] - g[i];
-        sy += step[i] * change[i];
-        ss += step[i] * step[i];
-        yy += change[i] * change[i];
-      }
-      if (sy > 1e-12 * sqrt(ss * yy)) {
-        pairs.newest = (pairs.newest + 1) % PAIRS;
-        if (pairs.stored < PAIRS) ++pairs.stored;
-        for (i = 0; i < N_ACTIONS; ++i) {
-          pairs.s[nth(&pairs, 0) + i] = step[i];
-          pairs.y[nth(&pairs, 0) + i] = change[i];
-        }
-      }
-      if (f - f_low > noise) flat = doubted = 0;
-      else if (tries == 1 || doubted) ++flat;
-      f = f_low;
-      for (i = 0; i < N_ACTIONS; ++i) {
-        u[i] = u_low[i];
-        g[i] = g_low[i];
-      }
-      fresh = 1;
-    } else if (fresh) {
-      pairs.stored = 0;
-    }
-    if (spent >= iterations) break;
-    history[spent++] = -(t_low > 0 && !accepted ? fmin(f, f_low) : f);
-    /* Gains lost in rounding mean that it has arrived, if the gradient alone, without curvature pairs, gains no more. */
-    if (doubted && flat >= 1) *outcome = CONVERGED;
-    if (flat >= 2) {
-      doubted = 1;
-      flat = 0;
-      pairs.stored = 0;
-    }
-    if (*outcome != ITERATION_LIMIT) break;
   }
-  place(u, low, high, x);
-  *value = -f;
-  return spent;
+  if (k->f - k->f_low > noise)
+    k->flat = k->doubted = 0;
+  else if (k->tries == 1 || k->doubted)
+    ++k->flat;
+  k->f = k->f_low;
+  for (i = 0; i < N_ACTIONS; ++i) {
+    k->u[i] = k->u_low[i];
+    k->g[i] = k->g_low[i];
+  }
+  k->fresh = 1;
 }
 
-/* Move x by ADADELTA (Zeiler, arXiv:1212.5701, algorithm 1, with the sign of ascent) for at most `limit` steps.
-   J is divided by `scale`. history takes up to limit + 1 values, the start's first; returns their number. */
-static long long ascend(double *x, const struct inputs *in, const double *low, const double *high, long long limit,
-                        double rho, double epsilon, double tolerance, double scale, int oscillation, int scaled,
-                        int keep_best, double *value, int *outcome, double *history, double *work) {
-  double *g = work, *v = g + N_ACTIONS, *w = v + N_ACTIONS, *best = w + N_ACTIONS, *last = best + N_ACTIONS;
-  double j = 0, before, best_value, check = 0;
-  long long step = 0;
-  int i, falls = 0, failed = evaluate(x, in, &j, g);
-  for (i = 0; i < N_ACTIONS; ++i) {
-    v[i] = w[i] = 0;
-    best[i] = x[i];
-    check += g[i];
+/* Say where to look next; 0 if the climb has ended. */
+static int climb_on(struct walk *k, const struct settings *set) {
+  const double *low = set->low, *high = set->high;
+  int i;
+  if (*set->stop) {
+    k->limit = k->spent;
+    k->outcome = TIME_LIMIT;
   }
-  history[0] = j;
-  *outcome = ITERATION_LIMIT;
-  if (failed || !isfinite(j) || !isfinite(check)) {
-    *value = history[0] = -INFINITY;
-    *outcome = NOT_FINITE;
-    return 1;
-  }
-  best_value = j;
-  while (step < limit) {
-    if (*in->stop) {
-      *outcome = TIME_LIMIT;
-      break;
-    }
-    before = j;
+  if (k->fresh) {
+    double *const mask = k->scratch[0], *const free = k->scratch[1], *const to_bound = k->scratch[2];
+    k->slope = 0;
     for (i = 0; i < N_ACTIONS; ++i) {
-      double span = scaled ? high[i] - low[i] : 1, slope = g[i] * span / scale, delta;
-      last[i] = x[i];
-      v[i] = rho * v[i] + (1 - rho) * slope * slope;
-      delta = slope * sqrt((w[i] + epsilon) / (v[i] + epsilon));
-      w[i] = rho * w[i] + (1 - rho) * delta * delta;
-      x[i] = fmin(fmax(x[i] + delta * span, low[i]), high[i]);
+      int held = high[i] <= low[i] || (k->u[i] <= 0 && k->g[i] > 0) || (k->u[i] >= 1 && k->g[i] < 0);
+      free[i] = mask[i] = held ? 0 : 1;
+      k->slope = larger(k->slope, mask[i] * fabs(k->g[i]));
     }
-    failed = evaluate(x, in, &j, g);
-    check = 0;
-    for (i = 0; i < N_ACTIONS; ++i) check += g[i];
-    if (failed || !isfinite(j) || !isfinite(check)) {
-      history[++step] = -INFINITY;
-      j = before; /* the last finite iterate counts */
-      for (i = 0; i < N_ACTIONS; ++i) x[i] = last[i];
-      *outcome = NOT_FINITE;
-      break;
+    if (k->slope <= k->tolerance) {
+      k->outcome = CONVERGED;
+      return 0;
     }
-    history[++step] = j;
-    if (j > best_value) {
-      best_value = j;
-      for (i = 0; i < N_ACTIONS; ++i) best[i] = x[i];
+    k->descent = direction(&k->pairs, k->u, k->g, mask, k->d, to_bound);
+    if (k->pairs.stored == 0 || !(k->descent < 0)) { /* nothing known of the curvature: along the gradient */
+      k->descent = 0;
+      for (i = 0; i < N_ACTIONS; ++i) {
+        k->d[i] = -free[i] * k->g[i] * (FIRST_STEP / k->slope);
+        k->descent += k->g[i] * k->d[i];
+      }
     }
-    if (j >= before && j - before < tolerance) {
-      *outcome = CONVERGED;
-      break;
+    k->longest = largest(k->d);
+    k->t = k->longest > LONGEST_STEP ? LONGEST_STEP / k->longest : 1;
+    k->t_low = 0;
+    k->t_high = INFINITY;
+    k->tries = 0;
+    k->fresh = 0;
+  }
+  if (k->spent >= k->limit) {
+    if (k->t_low > 0) accept(k, SMALLEST_GAIN * fabs(k->f));
+    return 0;
+  }
+  k->predicted = 0;
+  for (i = 0; i < N_ACTIONS; ++i) {
+    k->trial[i] = smaller(larger(k->u[i] + k->t * k->d[i], 0), 1);
+    k->predicted += k->g[i] * (k->trial[i] - k->u[i]);
+  }
+  place(k->trial, low, high, k->x);
+  return 1;
+}
+
+/* Climb by projected L-BFGS (Liu & Nocedal 1989): take in value and gradient at x, and say where to look next; 0 at the end.
+   The line search brackets a step that satisfies the weak Wolfe conditions, with which BFGS also gets past kinks (Lewis &
+   Overton 2013). */
+static int climb(struct walk *k, const struct settings *set, double value, double *g_trial) {
+  double f_trial = -value, check = 0, slope_trial = 0, noise;
+  int i, finite, gained, accepted = 0;
+  for (i = 0; i < N_ACTIONS; ++i) {
+    g_trial[i] *= -(set->high[i] - set->low[i]);
+    check += g_trial[i];
+  }
+  finite = isfinite(value) && isfinite(check);
+  if (!k->begun) {
+    k->begun = 1;
+    k->history[k->spent++] = finite ? value : -INFINITY;
+    k->f = finite ? f_trial : INFINITY;
+    k->outcome = finite ? ITERATION_LIMIT : NOT_FINITE;
+    for (i = 0; i < N_ACTIONS; ++i) k->g[i] = g_trial[i];
+    k->fresh = 1;
+    return finite && climb_on(k, set);
+  }
+  noise = SMALLEST_GAIN * fabs(k->f);
+  gained = finite && k->predicted < 0 && f_trial <= k->f + ARMIJO * k->predicted + noise;
+  for (i = 0; i < N_ACTIONS; ++i)
+    if (k->trial[i] > 0 && k->trial[i] < 1) slope_trial += g_trial[i] * k->d[i];
+  ++k->tries;
+  if (gained) { /* the best step so far, if not yet a good one */
+    k->t_low = k->t;
+    k->f_low = f_trial;
+    for (i = 0; i < N_ACTIONS; ++i) {
+      k->u_low[i] = k->trial[i];
+      k->g_low[i] = g_trial[i];
     }
-    falls += j < before;
-    if (falls >= oscillation) {
-      *outcome = OSCILLATION;
-      break;
+    accepted = slope_trial >= CURVATURE * k->descent || k->f - f_trial <= noise || k->tries > MOST_TRIES ||
+               (isinf(k->t_high) && k->t * k->longest >= LONGEST_STEP);
+    k->t = isinf(k->t_high) ? smaller(4 * k->t, LONGEST_STEP / k->longest) : (k->t_low + k->t_high) / 2;
+  } else {
+    double moved = 0;
+    for (i = 0; i < N_ACTIONS; ++i) moved = larger(moved, fabs(k->trial[i] - k->u[i]));
+    k->t_high = k->t;
+    if (k->t_low > 0) {
+      k->t = (k->t_low + k->t_high) / 2;
+    } else { /* the minimum of the parabola through f, its slope and the new value, within a tenth to a half */
+      double rise = f_trial - k->f - k->predicted;
+      double shrink = finite && rise > 0 ? -k->predicted / (2 * rise) : 0.1;
+      k->t *= smaller(larger(shrink, 0.1), 0.5);
+    }
+    if (k->tries > MOST_TRIES || moved <= 1e-16) {
+      accepted = k->t_low > 0;
+      if (!accepted) {
+        /* No step gains any more. If the curvature pairs are to blame, the gradient alone will still gain. */
+        if (k->pairs.stored == 0) k->outcome = k->doubted || k->slope <= LOOSE * k->tolerance ? CONVERGED : STALLED;
+        k->fresh = 1;
+        k->pairs.stored = 0;
+      }
     }
   }
-  *value = j;
-  if (keep_best) {
-    for (i = 0; i < N_ACTIONS; ++i) x[i] = best[i];
-    *value = best_value;
+  if (accepted) accept(k, noise);
+  k->history[k->spent++] = -(k->t_low > 0 && !accepted ? smaller(k->f, k->f_low) : k->f);
+  /* Gains lost in rounding mean that it has arrived, if the gradient alone, without curvature pairs, gains no more. */
+  if (k->doubted && k->flat >= 1) k->outcome = CONVERGED;
+  if (k->flat >= 2) {
+    k->doubted = 1;
+    k->flat = 0;
+    k->pairs.stored = 0;
   }
-  return step + 1;
+  return k->outcome == ITERATION_LIMIT && climb_on(k, set);
+}
+
+/* Ascend by ADADELTA (Zeiler 2012, algorithm 1, with the sign of ascent): take in value and gradient at x, and make a step;
+   0 at the end. */
+static int ascend(struct walk *k, const struct settings *set, double value, double *g) {
+  double check = 0;
+  int i, finite;
+  for (i = 0; i < N_ACTIONS; ++i) check += g[i];
+  finite = isfinite(value) && isfinite(check);
+  if (!k->begun) {
+    k->begun = 1;
+    k->history[k->spent++] = finite ? value : -INFINITY;
+    k->outcome = finite ? ITERATION_LIMIT : NOT_FINITE;
+    k->value = k->best_value = finite ? value : -INFINITY;
+    for (i = 0; i < N_ACTIONS; ++i) k->best[i] = k->x[i];
+    if (!finite) return 0;
+  } else if (!finite) {
+    k->history[k->spent++] = -INFINITY;
+    k->outcome = NOT_FINITE; /* the last finite point counts */
+    for (i = 0; i < N_ACTIONS; ++i) k->x[i] = k->u[i];
+    return 0;
+  } else {
+    const double before = k->value;
+    k->history[k->spent++] = k->value = value;
+    if (value > k->best_value) {
+      k->best_value = value;
+      for (i = 0; i < N_ACTIONS; ++i) k->best[i] = k->x[i];
+    }
+    k->falls += value < before;
+    if (value >= before && value - before < k->tolerance)
+      k->outcome = CONVERGED;
+    else if (k->falls >= set->oscillation)
+      k->outcome = OSCILLATION;
+    if (k->outcome != ITERATION_LIMIT) return 0;
+  }
+  if (k->spent >= k->limit) return 0;
+  if (*set->stop) {
+    k->outcome = TIME_LIMIT;
+    return 0;
+  }
+  for (i = 0; i < N_ACTIONS; ++i) {
+    double span = set->scaled ? set->high[i] - set->low[i] : 1, slope = g[i] * span / k->scale, move;
+    double *v = k->mean_square + i, *w = k->mean_move + i;
+    k->u[i] = k->x[i];
+    *v = set->decay * *v + (1 - set->decay) * slope * slope;
+    move = slope * sqrt((*w + set->epsilon) / (*v + set->epsilon));
+    *w = set->decay * *w + (1 - set->decay) * move * move;
+    k->x[i] = smaller(larger(k->x[i] + move * span, set->low[i]), set->high[i]);
+  }
+  return 1;
+}
+
+/* Searches from many points. Points that are evaluated side by side have the same selections. */
+struct search {
+  struct settings set;
+  long count, active; /* points, and walks under way here */
+  long *next;         /* the first point that waits, for all threads */
+  long most;          /* walks at once: threads share few points evenly */
+  const double *points, *chosen, *tolerances, *scales; /* (count, N_ACTIONS), (count, N_SELECTIONS), (count), (count) */
+  double *ends, *values, *histories;                   /* (count, N_ACTIONS), (count), (count, limit) */
+  int *outcomes;                                       /* (count), UNDER_WAY at first */
+  long long *spent;                                    /* (count) */
+  struct walk walks[MOST_LANES];
+};
+
+static void begin_walk(struct walk *k, const struct search *all, long start) {
+  const double *x = all->points + start * N_ACTIONS, *low = all->set.low, *high = all->set.high;
+  int i;
+  memset(k, 0, sizeof *k);
+  k->start = start;
+  k->tolerance = all->tolerances[start];
+  k->scale = all->scales[start];
+  k->history = all->histories + start * all->set.limit;
+  k->limit = all->set.limit;
+  k->pairs.s = k->s;
+  k->pairs.y = k->y;
+  k->pairs.newest = -1;
+  for (i = 0; i < N_ACTIONS; ++i) {
+    k->u[i] = high[i] > low[i] ? smaller(larger((x[i] - low[i]) / (high[i] - low[i]), 0), 1) : 0;
+    k->x[i] = x[i];
+  }
+  if (!all->set.ascends) place(k->u, low, high, k->x);
+}
+
+static void end_walk(struct walk *k, const struct search *all) {
+  double *end = all->ends + k->start * N_ACTIONS;
+  int i;
+  if (!all->set.ascends) {
+    place(k->u, all->set.low, all->set.high, k->x);
+    k->value = -k->f;
+  } else if (all->set.keep_best) {
+    for (i = 0; i < N_ACTIONS; ++i) k->x[i] = k->best[i];
+    k->value = k->best_value;
+  }
+  for (i = 0; i < N_ACTIONS; ++i) end[i] = k->x[i];
+  all->values[k->start] = k->value;
+  all->spent[k->start] = k->spent;
+  all->outcomes[k->start] = k->outcome;
+}
+
+/* Evaluate all walks once and let each make a step, `rounds` times or until none is left. */
+static void advance(struct search *all, const struct lanes *lanes, long rounds) {
+  for (; rounds > 0; --rounds) {
+    long b, B, left = 0;
+    int i;
+    for (;;) { /* a point takes a place if it has the same selections as the others */
+      long start = __atomic_load_n(all->next, __ATOMIC_RELAXED);
+      if (all->active >= all->most || start >= all->count) break;
+      if (all->active && memcmp(all->chosen + start * N_SELECTIONS, all->chosen + all->walks[0].start * N_SELECTIONS,
+                                N_SELECTIONS * sizeof(double)))
+        break;
+      if (__atomic_compare_exchange_n(all->next, &start, start + 1, 0, __ATOMIC_RELAXED, __ATOMIC_RELAXED))
+        begin_walk(all->walks + all->active++, all, start);
+    }
+    if (!all->active) return;
+    B = fill(all->active);
+    for (b = 0; b < B; ++b) {
+      const struct walk *k = all->walks + (b < all->active ? b : 0);
+      for (i = 0; i < N_ACTIONS; ++i) lanes->x[i * B + b] = (real) k->x[i];
+      for (i = 0; i < N_SELECTIONS; ++i) lanes->chosen[i * B + b] = (real) all->chosen[k->start * N_SELECTIONS + i];
+    }
+    evaluate(lanes, B);
+    for (b = 0; b < all->active; ++b) {
+      struct walk *k = all->walks + b;
+      double *const gradient = k->scratch[2];
+      for (i = 0; i < N_ACTIONS; ++i) gradient[i] = (double) lanes->gradient[i * B + b];
+      if ((all->set.ascends ? ascend : climb)(k, &all->set, (double) lanes->value[b], gradient)) {
+        if (left < b) {
+          all->walks[left] = *k;
+          all->walks[left].pairs.s = all->walks[left].s;
+          all->walks[left].pairs.y = all->walks[left].y;
+        }
+        ++left;
+      } else {
+        end_walk(k, all);
+      }
+    }
+    all->active = left;
+  }
 }

@@ -11,6 +11,7 @@ import stat
 import subprocess
 import tempfile
 import warnings
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -18,9 +19,9 @@ import platformdirs
 
 from symgraph.errors import CompileError
 
-# What -O2 does for generated code in half of its time: vectors; the short functions inlined; and, as one of the
-# "expensive" optimizations, the upper halves of vector registers cleared before the C library is called, whose exp and
-# erf take ten times as long on many processors where they are not.
+# What -O2 does for generated code in less time: the short functions inlined; and, as one of the "expensive"
+# optimizations, the upper halves of vector registers cleared before the C library is called, whose scalar functions
+# take ten times as long on many processors where they are not.
 _OPTIMIZATIONS = (
     "-O1",
     "-fexpensive-optimizations",
@@ -32,6 +33,7 @@ _OPTIMIZATIONS = (
 # to keep up for nobody here.
 _ARITHMETIC = "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast"
 FLAGS = ("-fPIC", "-std=c99", "-march=native", *_OPTIMIZATIONS, *_ARITHMETIC)
+VECTOR_LIBRARY = 2, 35  # of glibc, from which on libmvec has all that lanes.c calls
 
 
 @cache
@@ -49,22 +51,38 @@ def find_compiler() -> str | None:
     return None
 
 
-def load(source: str, compiler: str) -> ctypes.CDLL:
+def load(key: str, source: Callable[[], str], compiler: str) -> ctypes.CDLL:
     """Compile C source, or find it compiled, and load it.
+
+    Args:
+        key: what the source follows from.
+        source: makes it, where it is not found compiled.
+        compiler: the path of the compiler.
 
     Raises:
         CompileError: the compiler, the disk or the loader refused.
     """
     try:
         folder = _private_folder()
-        key = hashlib.sha256("\0".join([source, *_identity(compiler), *FLAGS]).encode()).hexdigest()[:32]
+        flags = "\0".join([key, *_identity(compiler), *FLAGS, *vector_library()[0]])
+        key = hashlib.sha256(flags.encode()).hexdigest()[:32]
         for path in folder.glob(f"{key}-*.so"):
             if path.name == _name(key, path):
                 return ctypes.CDLL(str(path))
             path.unlink(missing_ok=True)  # cut short by a crash or a full disk: make it anew
-        return ctypes.CDLL(str(_compile(source, compiler, folder, key)))
+        return ctypes.CDLL(str(_compile(source(), compiler, folder, key)))
     except OSError as error:
         raise CompileError(f"compiling with {compiler} failed: {error}") from error
+
+
+@cache
+def vector_library() -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return macros and libraries for the C library's functions of vectors, where it has them."""
+    name, version = platform.libc_ver()
+    numbers = tuple(int(part) for part in version.split(".") if part.isdigit())
+    if name == "glibc" and numbers >= VECTOR_LIBRARY and platform.machine() in ("x86_64", "AMD64"):
+        return ("-DLIBMVEC",), ("-lmvec", "-lm")
+    return (), ("-lm",)
 
 
 def _compile(source: str, compiler: str, cache_folder: Path, key: str) -> Path:
@@ -72,7 +90,8 @@ def _compile(source: str, compiler: str, cache_folder: Path, key: str) -> Path:
     with tempfile.TemporaryDirectory(dir=cache_folder) as folder:
         source_file, made = Path(folder, "kernel.c"), Path(folder, "kernel.so")
         source_file.write_text(source)
-        command = [compiler, "-shared", *FLAGS, str(source_file), "-o", str(made), "-lm"]
+        macros, libraries = vector_library()
+        command = [compiler, "-shared", *FLAGS, *macros, str(source_file), "-o", str(made), *libraries]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             raise CompileError(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")

@@ -48,9 +48,9 @@ class Mixture:
         return self.means if len(self.weights) == 1 else ca.mtimes(self.means, ca.DM(self.weights))
 
     def covariance(self, begin: int = 0, end: int | None = None) -> ca.MX:
-        """Return the covariance of outputs, of all (m, m) or from `begin` to `end`; without non-zeros for a single point.
+        """Return the covariance of all outputs (m, m), or from `begin` to `end`; without non-zeros for a single point.
 
-        It is that within the components and that between them. For one output it costs far less than a part of the whole.
+        It is that within the components and that between them. For one output it costs less than a part of the whole.
         """
         rows = slice(begin, self.means.shape[0] if end is None else end)
         m = rows.stop - rows.start
@@ -125,7 +125,7 @@ def _full(layers: Layers, mean: ca.MX, root: ca.MX, exact: bool = False) -> Mixt
         mean = _affine(weight, mean, bias)
         before = _outer(ca.mtimes(weight, first)) if covariance is None else ca.mtimes([weight, covariance, weight.T])
         after = rectify(mean, ca.diag(before))
-        mean, covariance = after.mean, pair_covariance(before, after, exact)
+        mean, covariance = after.mean, pair_covariance(mean, before, after, exact)
     weight, bias = layers[-1]
     after_last = _outer(ca.mtimes(weight, first)) if covariance is None else ca.mtimes([weight, covariance, weight.T])
     return _single(_affine(weight, mean, bias), after_last)
@@ -211,7 +211,7 @@ MOST_SPLIT = 6  # uncertain directions that "auto" splits along
 
 
 def _directions(weight: ca.MX, root: ca.MX) -> ca.MX:
-    """Return weight · root (h, d); where a direction is that of a single input, one number scales a column of weights."""
+    """Return weight · root (h, d); a direction that is that of one input scales a column of weights."""
     alone, rows, others = _directions_of(root)
     parts = []
     if rows:

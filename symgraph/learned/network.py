@@ -298,7 +298,7 @@ class StochasticNetwork(LearnedModel):
         return (sd * self._error_scale.value[:, 0]) ** 2
 
     def _moments(self, mean: ca.MX, root: ca.MX | None) -> tuple[ca.MX, Callable[[int, int], ca.MX]]:
-        """Return the outputs' mean (m, 1), and their covariance from one to another, for an input N(mean, root rootᵀ)."""
+        """Return the outputs' mean (m, 1), and their covariance from one to another, given N(mean, root rootᵀ)."""
         passed = pass_through(self.propagation, self._mean.layers, mean, root)
         if self.error == "none":
             return passed.mean, passed.covariance
@@ -320,9 +320,12 @@ class StochasticNetwork(LearnedModel):
         if key not in self._built:
             n = self._mean.sizes[0]
             mean, sigma = ca.MX.sym("mean", n), ca.MX.sym("sigma", n, n)
-            roots = [ca.mtimes(ca.sparsify(ca.DM(np.eye(n)[:, rows])), square_root(sigma[rows, rows])) for rows in uncertain]
-            y, covariance = self._moments(mean, ca.horzcat(*roots) if roots else None)
-            moments = y, covariance(0, y.numel())
+            places = [ca.sparsify(ca.DM(np.eye(n)[:, rows])) for rows in uncertain]
+            roots = [
+                ca.mtimes(place, square_root(sigma[rows, rows])) for place, rows in zip(places, uncertain, strict=True)
+            ]
+            y, spread = self._moments(mean, ca.horzcat(*roots) if roots else None)
+            moments = y, spread(0, y.numel())
             symbols = [mean, sigma, *(p.symbol for p in self.parameters)]
             self._built[key] = FlatFunction(ca.Function("predict", symbols, [ca.densify(part) for part in moments]))
         return self._built[key]

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from symgraph.compile.kernel import AdadeltaSteps, BoundKernel, Ended
+from symgraph.compile.kernel import AdadeltaSteps, BoundKernel
 from symgraph.errors import InputError
 from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
 from symgraph.optimizers.settings import number, positive_whole
 from symgraph.optimizers.starts import climbed, promising_points, status_of
-from symgraph.slots import Array, Choices
 
-RUNS_PER_TASK = 4  # runs that a worker process is handed at once
-MAX_DEATHS = 2  # workers that may die before the search ends with what it has
 SMALLEST_EPSILON = 1e-300  # 0 would keep every point where it is
 SAMPLES_PER_COMBINATION = 8
 POLISHED = 2  # best runs of each combination of selections that are polished
@@ -56,7 +51,6 @@ class Adadelta(Optimizer):
         keep_best: a run's result is its best iterate; else its last.
         polish: climb on from the best runs of each combination with L-BFGS.
         start_per_selection: one more start for each selection variable, as in the paper.
-        processes: worker processes that share the runs.
 
     Source: Yamaguchi & Atkeson, Humanoids 2016, section II-D; Zeiler, arXiv:1212.5701 (ADADELTA).
     """
@@ -76,10 +70,9 @@ class Adadelta(Optimizer):
     keep_best: bool = True
     polish: bool = True
     start_per_selection: bool = False
-    processes: int = 1
 
     @classmethod
-    def paper(cls, processes: int = 1) -> Adadelta:
+    def paper(cls) -> Adadelta:
         """Return the settings behind the paper's results."""
         return cls(
             starts=20,
@@ -97,11 +90,10 @@ class Adadelta(Optimizer):
             keep_best=False,
             polish=False,
             start_per_selection=True,
-            processes=processes,
         )
 
     def __post_init__(self) -> None:
-        for name in ("starts", "run_iterations", "oscillation", "processes"):
+        for name in ("starts", "run_iterations", "oscillation"):
             positive_whole(name, getattr(self, name), "Adadelta")
         for name in ("total_iterations", "finished"):
             if getattr(self, name) is not None:
@@ -116,36 +108,25 @@ class Adadelta(Optimizer):
         queue = _Queue(self, problem, rng)
         total = self.total_iterations or len(queue.waiting) * self.run_iterations
         wanted = self.finished or len(queue.waiting)
-        spent, deaths = 0, 0
+        spent = 0
         ended: list[Run] = []
         finished: list[Run] = []
         interrupted = False
         try:
-            with _movers(self.processes) as move:
-                while (
-                    len(finished) < wanted
-                    and queue.waiting
-                    and spent < total
-                    and deaths <= MAX_DEATHS
-                    and not (ended and problem.stop)
-                ):
-                    # One point at a time, or a few per process, since handing them over has its price.
-                    most = 1 if self.processes == 1 else RUNS_PER_TASK * self.processes
-                    batch = queue.pop(min(most, wanted - len(finished)), finished)
-                    limit = min(self.run_iterations, max(1, (total - spent) // len(batch)))
-                    runs = move(self, problem, batch, limit)
-                    deaths += any(run.outcome == "worker died" for run in runs)
-                    for run in runs:
-                        spent += len(run.history) - 1
-                        best = best_of(finished)
-                        if run.outcome == "converged" or (
-                            run.outcome in ("iteration limit", "oscillation")
-                            and (best is None or run.value > best.value)
-                        ):
-                            finished.append(run)
-                        if self.requeue and run.outcome in ("converged", "iteration limit", "oscillation"):
-                            queue.waiting.append(run)
-                    ended += runs
+            while len(finished) < wanted and queue.waiting and spent < total and not (ended and problem.stop):
+                # Where runs come back to the queue, each decides which one is next.
+                batch = queue.pop(1 if self.requeue else wanted - len(finished), finished)
+                limit = min(self.run_iterations, max(1, (total - spent) // len(batch)))
+                for run in self._moved(problem, batch, limit):
+                    spent += len(run.history) - 1
+                    best = best_of(finished)
+                    if run.outcome == "converged" or (
+                        run.outcome in ("iteration limit", "oscillation") and (best is None or run.value > best.value)
+                    ):
+                        finished.append(run)
+                    if self.requeue and run.outcome in ("converged", "iteration limit", "oscillation"):
+                        queue.waiting.append(run)
+                    ended.append(run)
                     problem.progress.update(max(spent / total, len(finished) / wanted), 1.0)
         except KeyboardInterrupt:
             interrupted = True
@@ -153,15 +134,20 @@ class Adadelta(Optimizer):
         if self.polish and not interrupted and not problem.stop:
             polished, interrupted = self._polished(problem, ended)
         ended = [*map(problem.judge, ended), *polished]
-        status = status_of(problem, ended)
-        if deaths > MAX_DEATHS:
-            status = f"best of {len(ended)} runs: given up, because worker processes died again and again"
-        return Search(ended, status, interrupted)
+        return Search(ended, status_of(problem, ended), interrupted)
 
-    def _steps(self, problem: Problem, choice: Choices) -> AdadeltaSteps:
-        scale = problem.scale(choice) if self.scaled else 1.0
-        numbers = self.decay, self.epsilon, self.tolerance * scale
-        return AdadeltaSteps(*numbers, scale, self.oscillation, self.scaled, self.keep_best)
+    def _moved(self, problem: Problem, batch: list[Run], limit: int) -> Iterator[Run]:
+        """Move points for at most `limit` steps each; a point that came back keeps where it first started."""
+        steps = AdadeltaSteps(self.decay, self.epsilon, self.tolerance, self.oscillation, self.scaled, self.keep_best)
+        groups: dict[int, tuple[BoundKernel, list[Run]]] = {}
+        for run in batch:
+            kernel = problem.kernel_for(run.choices)
+            groups.setdefault(id(kernel), (kernel, []))[1].append(run)
+        for kernel, runs in groups.values():
+            points, choices = np.array([run.point for run in runs]), np.array([run.choices for run in runs])
+            scales = np.array([problem.scale(run.choices) if self.scaled else 1.0 for run in runs])
+            for p, moved in kernel.ascend(points, problem.one_hot(choices), limit, steps, scales):
+                yield Run.of(runs[p].start, runs[p].choices, moved)
 
     @staticmethod
     def _polished(problem: Problem, runs: list[Run]) -> tuple[list[Run], bool]:
@@ -227,41 +213,3 @@ class _Queue:
         noise = 0.001 * (high - low) * self._rng.standard_normal(self._problem.n)
         point = np.clip(best.point + noise, low, high)
         return Run(point, point, best.choices, -np.inf, "iteration limit", np.zeros(0))
-
-
-def _move(kernels: list[BoundKernel], points: Array, hot: Array, limit: int, steps: list[AdadeltaSteps]) -> list[Ended]:
-    """Move points (P, n) one after the other; at the top level so that worker processes find it."""
-    return [k.ascend(p, h, limit, s) for k, p, h, s in zip(kernels, points, hot, steps, strict=True)]
-
-
-@contextmanager
-def _movers(processes: int) -> Iterator[Callable[[Adadelta, Problem, list[Run], int], list[Run]]]:
-    """Yield the function that moves a batch of runs, in this process or in several."""
-    if processes == 1:
-        yield lambda settings, problem, batch, limit: _joined(batch, _move(*_task(settings, problem, batch, limit)))
-        return
-    from joblib import Parallel, delayed
-    from joblib.externals.loky.process_executor import TerminatedWorkerError
-
-    with Parallel(n_jobs=processes, max_nbytes=None) as parallel:
-
-        def move(settings: Adadelta, problem: Problem, batch: list[Run], limit: int) -> list[Run]:
-            blocks = [batch[i::processes] for i in range(processes) if batch[i::processes]]
-            try:
-                results = parallel([delayed(_move)(*_task(settings, problem, block, limit)) for block in blocks])
-            except TerminatedWorkerError:
-                return [Run(r.start, r.point, r.choices, r.value, "worker died", r.history) for r in batch]
-            return [run for block, ended in zip(blocks, results, strict=True) for run in _joined(block, ended)]
-
-        yield move
-
-
-def _task(settings: Adadelta, problem: Problem, batch: list[Run], limit: int) -> tuple[Any, ...]:
-    points, choices = np.array([run.point for run in batch]), np.array([run.choices for run in batch])
-    steps = [settings._steps(problem, run.choices) for run in batch]
-    return [problem.kernel_for(run.choices) for run in batch], points, problem.one_hot(choices), limit, steps
-
-
-def _joined(batch: list[Run], ended: list[Ended]) -> list[Run]:
-    """A point that came back from the queue keeps where it first started."""
-    return [Run.of(before.start, before.choices, after) for before, after in zip(batch, ended, strict=True)]

@@ -160,7 +160,8 @@ class Constrained:
         margins = self._margins(start, hot)
         before, slack, left = np.inf, FIRST_TOLERANCE, iterations
         while True:
-            ended = self._bind(multipliers, weights).climb(point, hot, left, max(tolerance, slack) * scale)
+            closeness = np.array([max(tolerance, slack) * scale])
+            ((_, ended),) = self._bind(multipliers, weights).climb(point[None], hot[None], left, closeness)
             if len(history) == 1 and self.share(margins, choice) <= CLOSE:
                 kept = float(ended.history[0] + self.penalty(margins, choice, scale)), start
             history.append(ended.history)

@@ -27,24 +27,23 @@ def climbed(
     """Climb from points (P, n) under choices (P, s); return the runs, and whether an interrupt ended it before all."""
     hot = problem.one_hot(choices)
     runs: list[Run] = []
+    scales = np.array([problem.scale(choice) for choice in choices])
     try:
-        for p in range(len(points)):
-            if p and problem.stop:
-                break
-            runs.append(_climbed(problem, points[p], choices[p], hot[p], iterations, tolerance))
-            problem.progress.update(p + 1, len(points))
+        if problem.constrained is None:
+            for p, ended in problem.kernel.climb(points, hot, iterations, tolerance * scales):
+                runs.append(Run.of(points[p], choices[p], ended))
+                problem.progress.update(len(runs), len(points))
+        else:
+            for p in range(len(points)):
+                if p and problem.stop:
+                    break
+                problem.know(choices[p])
+                ended = problem.constrained.climb(points[p], choices[p], hot[p], iterations, tolerance, scales[p])
+                runs.append(problem.judge(Run.of(points[p], choices[p], ended)))
+                problem.progress.update(p + 1, len(points))
     except KeyboardInterrupt:
         return runs, True
     return runs, False
-
-
-def _climbed(problem: Problem, start: Array, choice: Choices, hot: Array, iterations: int, tolerance: float) -> Run:
-    scale = problem.scale(choice)
-    if problem.constrained is None:
-        return Run.of(start, choice, problem.kernel.climb(start, hot, iterations, tolerance * scale))
-    problem.know(choice)
-    ended = problem.constrained.climb(start, choice, hot, iterations, tolerance, scale)
-    return problem.judge(Run.of(start, choice, ended))
 
 
 def promising_points(problem: Problem, rng: np.random.Generator, starts: int, samples: int) -> tuple[Array, Choices]:

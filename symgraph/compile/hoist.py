@@ -1,0 +1,143 @@
+"""What the gradients of a search have in common is computed once, when a kernel is bound: programs are cut in two."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from symgraph.compile.differentiate import called, copied, recalled
+from symgraph.compile.program import CALLS, Indices, Kind, Operation, Program, Value, constant_of
+
+PANEL = 8  # rows of a packed matrix that stand together, see products.c
+
+
+class Hoister:
+    """Cuts programs, and those that they call, in two; what stands for them is kept and used again."""
+
+    def __init__(self) -> None:
+        self._halves: dict[Program, tuple[Program, Program]] = {}
+
+    def halves(self, program: Program) -> tuple[Program, Program]:
+        """Cut a program in two.
+
+        Returns:
+            the inputs that are bound → a block of numbers; all inputs and that block → the outputs. Matrices that are
+            bound and stand left in a product are packed. Outputs of the second one are of lanes.
+        """
+        if program not in self._halves:
+            self._halves[program] = self._cut(program)
+        return self._halves[program]
+
+    def _cut(self, program: Program) -> tuple[Program, Program]:
+        early = Program(
+            f"{program.name}_early", [Value(x.size, x.kind) for x in program.inputs if x.kind == Kind.BOUND]
+        )
+        whole = Program(program.name, [Value(x.size, x.kind) for x in program.inputs])
+        bound = [x for x in whole.inputs if x.kind == Kind.BOUND]
+        new = dict(zip(program.inputs, whole.inputs, strict=True))
+        for operation in _used(program):
+            self._rewrite(whole, operation, new)
+        outputs = [_of_lanes(whole, new[value]) for value in program.outputs]
+
+        wanted = dict.fromkeys(
+            value
+            for values in (outputs, *(o.args for o in whole.operations if o.outputs[0].kind > Kind.BOUND))
+            for value in values
+            if value.kind == Kind.BOUND and not _is_free(value)
+        )
+        block = Value(sum(value.size for value in wanted), Kind.BOUND)
+        late = Program(program.name, [*(Value(x.size, x.kind) for x in whole.inputs), block])
+        before = dict(zip(bound, early.inputs, strict=True))
+        after = dict(zip(whole.inputs, late.inputs, strict=False))
+        begin = 0
+        for value in wanted:
+            after[value] = late.gather([block], begin + np.arange(value.size))
+            begin += value.size
+        for operation in whole.operations:
+            if operation.outputs[0].kind == Kind.BOUND:
+                copied(early, operation, before)
+                if _is_free(operation.outputs[0]) and all(arg in after for arg in operation.args):
+                    copied(late, operation, after)
+            else:
+                copied(late, operation, after)
+        early.outputs = (early.concatenate([before[value] for value in wanted]),)
+        late.outputs = tuple(after[value] for value in outputs)
+        return _pruned(early), _pruned(late)
+
+    def _rewrite(self, whole: Program, operation: Operation, new: dict[Value, Value]) -> None:
+        if operation.code == "ruled":  # it has served
+            new.update(zip(operation.outputs, (new[arg] for arg in operation.args), strict=False))
+        elif operation.outputs[0].kind == Kind.BOUND:
+            copied(whole, operation, new)
+        elif operation.code in CALLS:
+            self._rewrite_call(whole, operation, new)
+        elif operation.code == "product" and new[operation.args[0]].kind == Kind.BOUND:
+            left, right = (new[arg] for arg in operation.args)
+            m, k, n = operation.detail
+            (packed,) = whole.add("pack", (left,), (m, k), [-(-m // PANEL) * PANEL * k], (m, k))
+            made = whole.add("packed product", (packed, right), (m, k, n), [m * n], (m, k, n))
+            new[operation.outputs[0]] = made[0]
+        else:
+            copied(whole, operation, new)
+
+    def _rewrite_call(self, whole: Program, operation: Operation, new: dict[Value, Value]) -> None:
+        """A call of a program becomes one of its first half, which is bound, and one of its second half."""
+        args = [new[arg] for arg in operation.args]
+        first = int(operation.code == "switch")
+        times = operation.detail[1] if operation.code == "repeat" else 1
+        programs = called(operation)
+        halves = [self.halves(program) for program in programs]
+        blocks = []
+        for program, (early, _) in zip(programs, halves, strict=True):
+            given = tuple(arg for arg, x in zip(args[first:], program.inputs, strict=True) if x.kind == Kind.BOUND)
+            size = early.outputs[0].size * times
+            code, detail = ("repeat", (early, times)) if operation.code == "repeat" else ("call", early)
+            blocks.append(whole.add(code, given, detail, [size], detail)[0] if size else whole.constant(np.zeros(0)))
+        args[first:] = [
+            arg if x.kind == Kind.BOUND else _of_lanes(whole, arg)
+            for arg, x in zip(args[first:], programs[0].inputs, strict=True)
+        ]
+        if first:
+            args[0] = _of_lanes(whole, args[0])
+        detail = recalled(operation, [late for _, late in halves])
+        sizes = [output.size for output in operation.outputs]
+        made = whole.add(operation.code, (*args, *blocks), detail, sizes, detail)
+        new.update(zip(operation.outputs, made, strict=True))
+
+
+def _of_lanes(program: Program, value: Value) -> Value:
+    """Return the same numbers, for each point."""
+    if value.kind > Kind.BOUND:
+        return value
+    (spread,) = program.add("spread", (value,), None, [value.size])
+    spread.kind = Kind.BLOCK
+    return spread
+
+
+def _is_free(value: Value) -> bool:
+    """Whether a bound value costs nothing: an input, a constant, or consecutive numbers of such a one."""
+    maker = value.maker
+    if maker is None or constant_of(value) is not None:
+        return True
+    return maker.code == "gather" and len(maker.args) == 1 and is_run(maker.detail) and _is_free(maker.args[0])
+
+
+def is_run(indices: Indices) -> bool:
+    """Whether indices follow each other."""
+    return bool(indices.size and indices[0] >= 0 and (indices == indices[0] + np.arange(indices.size)).all())
+
+
+def _used(program: Program) -> list[Operation]:
+    """Return the operations that outputs follow from, in order."""
+    found: set[Operation] = set()
+    waiting = [value.maker for value in program.outputs]
+    while waiting:
+        operation = waiting.pop()
+        if operation is not None and operation not in found:
+            found.add(operation)
+            waiting += [arg.maker for arg in operation.args]
+    return [operation for operation in program.operations if operation in found]
+
+
+def _pruned(program: Program) -> Program:
+    program.operations = _used(program)
+    return program

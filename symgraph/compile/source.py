@@ -1,0 +1,67 @@
+"""The C source of a kernel: from a CasADi function to its gradient with the search around it."""
+
+from __future__ import annotations
+
+from importlib import resources
+
+import casadi as ca
+
+from symgraph.compile.differentiate import Differentiator
+from symgraph.compile.hoist import Hoister
+from symgraph.compile.program import Kind, Program
+from symgraph.compile.reading import Reader
+from symgraph.compile.writing import Writer
+
+MOST_LANES = 64  # points that are evaluated side by side; more fall out of the processor's cache
+
+
+def kernel_source(function: ca.Function, lanes: bool, single: bool) -> str:
+    """Return the source of a kernel.
+
+    Args:
+        function: actions (n, 1), selections (m, 1) and what is bound to a kernel → value (1, 1).
+        lanes: write it for points side by side, else for one at a time.
+        single: compute in single precision.
+    """
+    early, late = Hoister().halves(gradient_program(function))
+    writer = Writer()
+    early_name, early_work = writer.function(early, lanes=False)
+    late_name, late_work = writer.function(late, lanes=lanes)
+    numbers = {
+        "N_ACTIONS": function.nnz_in(0),
+        "N_SELECTIONS": function.nnz_in(1),
+        "N_SHARED": function.n_in() - 2,
+        "MOST_LANES": MOST_LANES if lanes else 1,
+        "BLOCK": early.outputs[0].size,
+        "EARLY": early_name,
+        "EARLY_WORK": early_work,
+        "LATE": late_name,
+        "LATE_WORK": late_work,
+    }
+    parts = [
+        _PRECISION[single],
+        _text("lanes.c"),
+        _text("products.c"),
+        writer.text(),
+        *(f"#define {name} {value}" for name, value in numbers.items()),
+        _text("search.c"),
+        _text("kernel.c"),
+    ]
+    return "\n".join(parts)
+
+
+def gradient_program(function: ca.Function) -> Program:
+    """Return the program of a function of actions, selections and bound inputs, and its gradient by the actions."""
+    kinds = [Kind.LANE, Kind.BLOCK, *[Kind.BOUND] * (function.n_in() - 2)]
+    return Differentiator().with_gradient(Reader(function).program(kinds), by=0)
+
+
+_PRECISION = {
+    False: "typedef double real;\ntypedef long long whole;\n#define MATH(name) name",
+    True: "typedef float real;\ntypedef int whole;\n#define MATH(name) name##f\n#define SINGLE",
+}
+
+
+def _text(name: str) -> str:
+    """Return a C file of this package."""
+    return (resources.files("symgraph.compile") / name).read_text()

@@ -1,0 +1,415 @@
+"""From programs to C."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from itertools import islice
+
+import casadi as ca
+import numpy as np
+
+from symgraph.compile.elementwise import expression
+from symgraph.compile.program import Indices, Operation, Program, Value, constant_of
+from symgraph.compile.schedule import Schedule, Step
+
+PART = 1000  # operations of one C function: the compiler's time grows faster than a function's length
+MOST_RUNS = 12  # copies that are written out; beyond that a table says what goes where
+
+
+class Writer:
+    """Writes C functions for programs and those that they call, each once.
+
+    A function takes its inputs, its outputs, workspace and the number of lanes. With lanes, a number that is not bound
+    is a row of as many numbers, one for each; the function does the same to all of them.
+    """
+
+    def __init__(self) -> None:
+        self._functions: dict[tuple[Program, bool], tuple[str, int]] = {}
+        self._tables: dict[tuple[str, bytes], str] = {}
+        self._externals: dict[int, tuple[ca.Function, str]] = {}
+        self._text: list[str] = []
+
+    def function(self, program: Program, lanes: bool) -> tuple[str, int]:
+        """Write a program; return its name, and the numbers of workspace that it takes, for each lane."""
+        key = program, lanes
+        if key not in self._functions:
+            name = f"f{len(self._functions)}"
+            self._functions[key] = name, 0  # the name is taken while those that it calls are written
+            self._functions[key] = name, _FunctionWriter(self, program, lanes, name).write()
+        return self._functions[key]
+
+    def text(self) -> str:
+        """Return all that was written; CasADi's code for functions that have no program comes first."""
+        return "\n".join([self._casadi(), *self._text])
+
+    def add(self, text: str) -> None:
+        self._text.append(text)
+
+    def table(self, kind: str, numbers: Iterable[float] | Iterable[int]) -> str:
+        """Return the name of a table of constants; equal ones are one."""
+        written = [repr(n) for n in numbers] if kind == "int" else [number(n) for n in numbers]
+        text = ", ".join(written)
+        key = kind, text.encode()
+        if key not in self._tables:
+            self._tables[key] = f"t{len(self._tables)}"
+            self.add(f"static const {kind} {self._tables[key]}[] = {{{text}}};")
+        return self._tables[key]
+
+    def external(self, function: ca.Function) -> str:
+        """Return the name under which CasADi's code is called."""
+        key = hash(function)
+        if key not in self._externals:
+            self._externals[key] = function, f"external_{len(self._externals)}"
+        return self._externals[key][1]
+
+    def _casadi(self) -> str:
+        if not self._externals:
+            return ""
+        generator = ca.CodeGenerator("externals", {"with_header": False, "include_math": False})
+        for function, name in self._externals.values():
+            inputs = function.mx_in()
+            generator.add(ca.Function(name, inputs, function.call(inputs, False, True)))
+        return generator.dump()
+
+
+def number(value: float) -> str:
+    """Return a number as C has it."""
+    value = float(value)
+    if np.isnan(value):
+        return "NAN"
+    if np.isinf(value):
+        return "INFINITY" if value > 0 else "-INFINITY"
+    return repr(value)
+
+
+class _FunctionWriter:
+    """Writes one program, cut into functions of moderate length."""
+
+    def __init__(self, writer: Writer, program: Program, lanes: bool, name: str) -> None:
+        self._writer = writer
+        self._program = program
+        self._lanes = lanes
+        self._name = name
+        self._schedule = Schedule(program, lanes)
+        self._below = 0  # workspace of what is called
+        self._lines: list[str] = []
+        self._parts: list[str] = []
+
+    def write(self) -> int:
+        count = 0
+        for step in self._schedule.steps:
+            self._write_step(step)
+            count += len(step)
+            if count >= PART:
+                self._end_part()
+                count = 0
+        self._write_outputs()
+        self._end_part()
+        calls = "\n".join(f"  {part}(arg, res, w, B);" for part in self._parts)
+        self._writer.add(f"static void {self._name}{_SIGNATURE} {{\n{calls}\n}}")
+        return self._schedule.work + self._below
+
+    def _end_part(self) -> None:
+        if self._lines:
+            name = f"{self._name}_{len(self._parts)}"
+            self._writer.add(f"static void {name}{_SIGNATURE} {{\n" + "\n".join(self._lines) + "\n}")
+            self._parts.append(name)
+            self._lines = []
+
+    # where things are
+
+    def _pointer(self, value: Value) -> str:
+        """Return where a value begins."""
+        numbers = constant_of(value)
+        if numbers is not None:
+            return self._writer.table("real", numbers.tolist())
+        place = self._schedule.place(value)
+        base = {"a": f"arg[{place.base[1:]}]", "r": f"res[{place.base[1:]}]", "w": "w"}[place.base[0]]
+        # The workspace, unlike inputs and outputs, has only numbers for all lanes, where there are lanes.
+        return f"{base} + {place.offset}{' * B' if place.wide else ''}" if place.offset else base
+
+    def _wide(self, value: Value) -> bool:
+        return self._schedule.is_wide(value)
+
+    def _each(self, value: Value) -> str:
+        """Return how many numbers a value has for each that it has without lanes."""
+        return "B" if self._wide(value) else "1"
+
+    # steps
+
+    def _write_step(self, step: Step) -> None:
+        operation = step[0]
+        if operation.is_elementwise:
+            self._write_loop(step)
+            return
+        getattr(self, f"_write_{str(operation.code).replace(' ', '_')}")(operation)
+
+    def _write_loop(self, step: Step) -> None:
+        size = step[0].outputs[0].size
+        loop = _Loop(self, size, self._lanes)
+        for operation in step:
+            loop.add(operation)
+        stored = [o.outputs[0] for o in step if self._schedule.is_used_later(o.outputs[0], step)]
+        self._lines += loop.lines(stored)
+
+    def _write_gather(self, operation: Operation) -> None:
+        (result,) = operation.outputs
+        self._copy(result, operation.args, operation.detail)
+
+    def _copy(self, result: Value, sources: Sequence[Value], where: Indices) -> None:
+        target, wide = self._pointer(result), self._wide(result)
+        edges = np.cumsum([0, *(source.size for source in sources)])
+        runs = list(islice(_runs(where, edges), MOST_RUNS + 1))
+        if len(runs) <= MOST_RUNS:
+            for source, begin, step, at, count in runs:
+                to = f"{target} + {at}{' * B' if wide else ''}"
+                if source < 0:
+                    self._lines.append(f"  zero({to}, {count}{' * B' if wide else ''});")
+                    continue
+                arg = sources[source]
+                if self._is_in_place(result, at, arg, begin, step):
+                    continue
+                come = f"{self._pointer(arg)} + {begin}{' * B' if self._wide(arg) else ''}"
+                do = "spread" if wide and not self._wide(arg) else "copy"
+                self._lines.append(f"  {do}({to}, {come}, {count}, {step}, {'B' if wide else 1});")
+            return
+        if (where < 0).any():
+            self._lines.append(f"  zero({target}, {result.size}{' * B' if wide else ''});")
+        for s, arg in enumerate(sources):
+            (places,) = np.nonzero((where >= edges[s]) & (where < edges[s + 1]))
+            if places.size and not self._is_in_place(result, int(places[0]), arg, 0, 1):
+                pairs = np.stack([places, where[places] - edges[s]], 1)
+                table = self._writer.table("int", pairs.ravel().tolist())
+                do = "spread" if wide and not self._wide(arg) else "copy"
+                pointers = f"{target}, {self._pointer(arg)}"
+                self._lines.append(f"  {do}_some({pointers}, {table}, {places.size}, {'B' if wide else 1});")
+
+    def _is_in_place(self, result: Value, at: int, arg: Value, begin: int, step: int) -> bool:
+        if constant_of(self._schedule.source(arg)) is not None or step != 1:
+            return False
+        there, here = self._schedule.place(result), self._schedule.place(arg)
+        return there.wide == here.wide and (there.base, there.offset + at) == (here.base, here.offset + begin)
+
+    def _write_spread(self, operation: Operation) -> None:
+        self._copy(operation.outputs[0], operation.args, np.arange(operation.args[0].size))
+
+    def _write_transpose(self, operation: Operation) -> None:
+        rows, columns = operation.detail
+        arg, result = operation.args[0], operation.outputs[0]
+        self._lines.append(
+            f"  transpose({self._pointer(result)}, {self._pointer(arg)}, {rows}, {columns}, {self._each(result)});"
+        )
+
+    def _write_product(self, operation: Operation) -> None:
+        (left, right), (result,) = operation.args, operation.outputs
+        pointers = ", ".join(map(self._pointer, (left, right, result)))
+        m, k, n = operation.detail
+        if self._wide(result):
+            each = f"{self._each(left)}, {self._each(right)}"
+            self._lines.append(f"  multiply_lanes({pointers}, {m}, {k}, {n}, {each}, B);")
+        else:
+            self._lines.append(f"  multiply({pointers}, {m}, {k}, {n});")
+
+    def _write_pack(self, operation: Operation) -> None:
+        m, k = operation.detail
+        self._lines.append(
+            f"  pack({self._pointer(operation.args[0])}, {self._pointer(operation.outputs[0])}, {m}, {k});"
+        )
+
+    def _write_packed_product(self, operation: Operation) -> None:
+        m, k, n = operation.detail
+        pointers = ", ".join(map(self._pointer, (*operation.args, *operation.outputs)))
+        do = "multiply_packed_lanes" if self._lanes else "multiply_packed"
+        self._lines.append(f"  {do}({pointers}, {m}, {k}, {n}{', B' if self._lanes else ''});")
+
+    def _write_accumulate(self, operation: Operation) -> None:
+        result = operation.outputs[0]
+        table = self._writer.table("int", np.stack(operation.detail, 1).ravel().tolist())
+        terms = len(operation.detail[0])
+        width = "B" if self._wide(result) else "1"
+        self._lines.append(f"  zero({self._pointer(result)}, {result.size} * {width});")
+        args = ", ".join(f"{self._pointer(arg)}, {self._each(arg)}" for arg in operation.args)
+        do = ("add_some", "add_products")[len(operation.args) - 1]
+        self._lines.append(f"  {do}({self._pointer(result)}, {table}, {terms}, {args}, {width});")
+
+    # calls
+
+    def _call(self, program: Program, args: Sequence[str], results: Sequence[str], indent: str = "  ") -> list[str]:
+        name, work = self._writer.function(program, self._lanes)
+        self._below = max(self._below, work)
+        given, made = ", ".join(args) or "0", ", ".join(results) or "0"
+        return [
+            f"{indent}{{ const real *const x[] = {{{given}}};",
+            f"{indent}  real *const y[] = {{{made}}};",
+            f"{indent}  {name}(x, y, {self._free()}, B); }}",
+        ]
+
+    def _free(self) -> str:
+        """Return where workspace for what is called begins."""
+        return f"w + {self._schedule.work}{' * B' if self._lanes else ''}"
+
+    def _write_call(self, operation: Operation) -> None:
+        args, results = map(self._pointer, operation.args), map(self._pointer, operation.outputs)
+        self._lines += self._call(operation.detail, list(args), list(results))
+
+    def _write_switch(self, operation: Operation) -> None:
+        index, *args = map(self._pointer, operation.args)
+        results = list(map(self._pointer, operation.outputs))
+        cases = operation.detail
+        inputs = len(args) - len(cases) if len(args) > len(cases[0].inputs) else len(args)
+        self._lines.append(f"  switch ((long) ({index})[0]) {{")
+        for i, case in enumerate(cases):
+            blocks = args[inputs + i : inputs + i + 1] if len(args) > inputs else []
+            self._lines.append(f"    {'default' if i == len(cases) - 1 else f'case {i}'}:")
+            self._lines += self._call(case, [*args[:inputs], *blocks], results, "      ")
+            self._lines.append("      break;")
+        self._lines.append("  }")
+
+    def _write_repeat(self, operation: Operation) -> None:
+        program, times = operation.detail
+
+        def moving(value: Value) -> str:
+            part = f"{value.size // times}{' * B' if self._wide(value) else ''}"
+            return f"{self._pointer(value)} + i * {part}"
+
+        args, results = list(map(moving, operation.args)), list(map(moving, operation.outputs))
+        self._lines.append(f"  {{ long i; for (i = 0; i < {times}; ++i)")
+        self._lines += self._call(program, args, results, "    ")
+        self._lines.append("  }")
+
+    def _write_external(self, operation: Operation) -> None:
+        """CasADi's own code does one lane after the other, with doubles of its own."""
+        function = operation.detail
+        name = self._writer.external(function)
+        count = sum(x.size for x in (*operation.args, *operation.outputs))
+        wide = self._wide(operation.outputs[0])
+        self._below = max(self._below, 2 * (count + function.sz_w() + 64))
+        lines = [
+            "  { long l, i;",
+            f"    const double *x[{function.sz_arg() + 8}]; double *y[{function.sz_res() + 8}];",
+            f"    casadi_int iw[{function.sz_iw() + 8}]; int failed;",
+            f"    double *const s = (double *) ({self._free()});",
+            f"    for (l = 0; l < {'B' if wide else 1}; ++l) {{",
+        ]
+        at = 0
+        for i, arg in enumerate(operation.args):
+            lines.append(f"      x[{i}] = s + {at};")
+            lines.append(f"      take({self._pointer(arg)}, {self._each(arg)}, l, s + {at}, {arg.size});")
+            at += arg.size
+        outs = []
+        for i, result in enumerate(operation.outputs):
+            lines.append(f"      y[{i}] = s + {at};")
+            outs.append(
+                f"      put({self._pointer(result)}, {self._each(result)}, l, s + {at}, {result.size}, failed);"
+            )
+            at += result.size
+        lines.append(f"      failed = {name}(x, y, iw, s + {at}, 0);")
+        self._lines += [*lines, *outs, "    } }"]
+
+    def _write_outputs(self) -> None:
+        for i, value in enumerate(self._program.outputs):
+            constant = constant_of(self._schedule.source(value))
+            if constant is None and self._schedule.place(value).base == f"r{i}":
+                continue
+            if value.size:
+                each = self._each(value)
+                self._lines.append(f"  copy(res[{i}], {self._pointer(value)}, {value.size}, 1, {each});")
+
+
+_SIGNATURE = "(const real *const *arg, real *const *res, real *w, long B)"
+
+
+class _Loop:
+    """Writes elementwise operations on arrays of one size as one loop."""
+
+    def __init__(self, writer: _FunctionWriter, size: int, lanes: bool) -> None:
+        self._writer = writer
+        self._size = size
+        self._lanes = lanes
+        self._vector = lanes or size > 1
+        self._names: dict[Value, str] = {}
+        self._body: list[str] = []
+        self._plain = True  # all arrays in step, element by element and lane by lane
+
+    def add(self, operation: Operation) -> None:
+        args = [self._read(arg) for arg in operation.args]
+        kind = "vec" if self._vector else "real"
+        text = expression(int(operation.code), args, "v" if self._vector else "s")
+        self._body.append(f"const {kind} {self._name(operation.outputs[0])} = {text};")
+
+    def _name(self, value: Value) -> str:
+        self._names[value] = f"v{len(self._names)}"
+        return self._names[value]
+
+    def _read(self, value: Value) -> str:
+        schedule = self._writer._schedule
+        root = schedule.source(value)
+        if value in self._names:
+            return self._names[value]
+        if root in self._names and root.size == value.size:
+            return self._names[root]
+        numbers = constant_of(value)
+        if numbers is not None and numbers.size == 1:
+            text = f"all({number(numbers[0])})" if self._vector else number(numbers[0])
+        else:
+            pointer, single, wide = self._writer._pointer(value), value.size < self._size, schedule.is_wide(value)
+            if not self._vector:
+                text = f"*({pointer})"
+            elif self._lanes and wide:
+                text = f"load({pointer} + {'l' if single and self._size > 1 else 'i'})"
+                self._plain = self._plain and not (single and self._size > 1)
+            elif self._lanes:
+                text = f"all(({pointer})[{'0' if single or self._size == 1 else 'e'}])"
+                self._plain = self._plain and (single or self._size == 1)
+            elif single:
+                text = f"all(*({pointer}))"
+            else:
+                text = f"load_some({pointer} + i, {self._size} - i)"
+        kind = "vec" if self._vector else "real"
+        name = self._name(value)
+        self._body.append(f"const {kind} {name} = {text};")
+        return name
+
+    def lines(self, stored: Sequence[Value]) -> list[str]:
+        """Return the loop, which ends by storing values."""
+        for value in stored:
+            pointer, name = self._writer._pointer(value), self._names[value]
+            if not self._vector:
+                self._body.append(f"*({pointer}) = {name};")
+            elif self._lanes:
+                self._body.append(f"store({pointer} + i, {name});")
+            else:
+                self._body.append(f"store_some({pointer} + i, {name}, {self._size} - i);")
+        if not self._vector:
+            head = ["  {"]
+        elif not self._lanes:
+            head = [f"  {{ long i; for (i = 0; i < {self._size}; i += VL) {{"]
+        elif self._plain:
+            head = [f"  {{ long i; for (i = 0; i < {self._size} * B; i += VL) {{"]
+        else:
+            loops = f"for (e = 0; e < {self._size}; ++e) for (l = 0; l < B; l += VL) {{"
+            head = [f"  {{ long e, l; {loops}", "    const long i = e * B + l;"]
+        tail = ["  } }"] if self._vector else ["  }"]
+        return [*head, *(f"    {line}" for line in self._body), *tail]
+
+
+def _runs(where: Indices, edges: Indices) -> Iterable[tuple[int, int, int, int, int]]:
+    """Split indices into runs of equal steps: (source or -1, its first number, step, place in the result, count)."""
+    if not where.size:
+        return
+    owner = np.where(where >= 0, np.searchsorted(edges, where, side="right") - 1, -1)
+    at = 0
+    while at < where.size:
+        source = int(owner[at])
+        if source < 0:
+            others = np.flatnonzero(owner[at:] >= 0)
+            end = at + int(others[0]) if others.size else where.size
+            yield -1, 0, 0, at, end - at
+        else:
+            step = int(where[at + 1] - where[at]) if at + 1 < where.size and owner[at + 1] == source else 1
+            here = where[at:]
+            kept = (owner[at:] == source) & (here == where[at] + step * np.arange(here.size))
+            breaks = np.flatnonzero(~kept)
+            end = at + int(breaks[0]) if breaks.size else where.size
+            yield source, int(where[at] - edges[source]), step, at, end - at
+        at = end
