@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
+import casadi as ca
 import numpy as np
 
 from symgraph.compile.differentiate import called, copied, recalled
@@ -11,9 +14,14 @@ PANEL = 8  # rows of a packed matrix that stand together, see products.c
 
 
 class Hoister:
-    """Cuts programs, and those that they call, in two; what stands for them is kept and used again."""
+    """Cuts programs, and those that they call, in two; what stands for them is kept and used again.
 
-    def __init__(self) -> None:
+    Args:
+        lanes: whether points are evaluated side by side.
+    """
+
+    def __init__(self, lanes: bool) -> None:
+        self._lanes = lanes
         self._halves: dict[Program, tuple[Program, Program]] = {}
 
     def halves(self, program: Program) -> tuple[Program, Program]:
@@ -34,8 +42,15 @@ class Hoister:
         whole = Program(program.name, [Value(x.size, x.kind) for x in program.inputs])
         bound = [x for x in whole.inputs if x.kind == Kind.BOUND]
         new = dict(zip(program.inputs, whole.inputs, strict=True))
-        for operation in _used(program):
-            self._rewrite(whole, operation, new)
+        operations = _used(program)
+        divisors = Counter(o.args[1] for o in operations if o.code == ca.OP_DIV and o.outputs[0].kind > Kind.BOUND)
+        for operation in operations:
+            if operation.code == ca.OP_DIV and divisors[operation.args[1]] > 1:  # one division serves all
+                x, y = (new[arg] for arg in operation.args)
+                inverse = whole.elementwise(ca.OP_INV, y)
+                new[operation.outputs[0]] = whole.elementwise(ca.OP_MUL, x, inverse)
+            else:
+                self._rewrite(whole, operation, new)
         outputs = [_of_lanes(whole, new[value]) for value in program.outputs]
 
         wanted = dict.fromkeys(
@@ -73,9 +88,13 @@ class Hoister:
         elif operation.code == "product" and new[operation.args[0]].kind == Kind.BOUND:
             left, right = (new[arg] for arg in operation.args)
             m, k, n = operation.detail
+            maker = left.maker
+            # A point alone is bound by how fast weights can be read: squares are better made anew.
+            squared = not self._lanes and maker is not None and maker.code == ca.OP_SQ
+            left = maker.args[0] if squared and maker is not None else left
             (packed,) = whole.add("pack", (left,), (m, k), [-(-m // PANEL) * PANEL * k], (m, k))
-            made = whole.add("packed product", (packed, right), (m, k, n), [m * n], (m, k, n))
-            new[operation.outputs[0]] = made[0]
+            detail = m, k, n, squared
+            new[operation.outputs[0]] = whole.add("packed product", (packed, right), detail, [m * n], detail)[0]
         else:
             copied(whole, operation, new)
 

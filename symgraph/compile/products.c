@@ -2,7 +2,7 @@
 
    A matrix of weights serves all gradients of a search, so it is packed once: panels of PANEL rows, in each the columns one
    after the other. A tile of the result, PANEL rows of one panel and up to three vectors, stays in registers while panel and
-   right factor are read once. */
+   right factor are read once, and the next panel is fetched from where weights lie that do not fit the near caches. */
 #define PANEL 8
 #if defined(__AVX512F__)
 #define TILE_ROWS 8 /* of 32 registers 24 hold a tile */
@@ -38,6 +38,7 @@ static void tile_3(const real *w, long k, const real *x0, const real *x1, const 
   EACH_ROW(ZERO_3)
   for (p = 0; p < k; ++p, w += PANEL, x0 += B, x1 += B, x2 += B) {
     const vec u = load(x0), v = load(x1), s = load(x2);
+    __builtin_prefetch(w + PANEL * k);
     EACH_ROW(ADD_3)
   }
   EACH_ROW(PUT_3)
@@ -50,6 +51,7 @@ static void tile_2(const real *w, long k, const real *x0, const real *x1, real *
   EACH_ROW(ZERO_2)
   for (p = 0; p < k; ++p, w += PANEL, x0 += B, x1 += B) {
     const vec u = load(x0), v = load(x1);
+    __builtin_prefetch(w + PANEL * k);
     EACH_ROW(ADD_2)
   }
   EACH_ROW(PUT_2)
@@ -62,6 +64,7 @@ static void tile_1(const real *w, long k, const real *x0, real *z0, long rows, l
   EACH_ROW(ZERO_1)
   for (p = 0; p < k; ++p, w += PANEL, x0 += B) {
     const vec u = load(x0);
+    __builtin_prefetch(w + PANEL * k);
     EACH_ROW(ADD_1)
   }
   EACH_ROW(PUT_1)
@@ -101,52 +104,57 @@ static inline void put_rows(real *z, row_vec x, long rows) {
   else
     memcpy(z, &x, (size_t) rows * sizeof(real));
 }
-#define PANEL_AT(p) (*(const row_vec *) (p))
 
-/* z (m, n) = w (m, k) x (k, n), w packed; bound by how fast w can be read, so four panels at once, or one for four columns. */
-static void multiply_packed(const real *w, const real *x, real *z, long m, long k, long n) {
-  long i, j, p;
-  for (j = 0; j + 4 <= n; j += 4, x += 4 * k, z += 4 * m) {
-    const real *panel = w, *const x1 = x + k, *const x2 = x + 2 * k, *const x3 = x + 3 * k;
-    for (i = 0; i < m; i += PANEL) {
-      row_vec a = {0}, b = {0}, c = {0}, d = {0};
-      for (p = 0; p < k; ++p, panel += PANEL) {
-        const row_vec row = PANEL_AT(panel);
-        a += row * x[p];
-        b += row * x1[p];
-        c += row * x2[p];
-        d += row * x3[p];
-      }
-      put_rows(z + i, a, m - i);
-      put_rows(z + m + i, b, m - i);
-      put_rows(z + 2 * m + i, c, m - i);
-      put_rows(z + 3 * m + i, d, m - i);
-    }
+/* z (m, n) = w (m, k) x (k, n), w packed, or with the squares of w; bound by how fast w can be read, so four panels at once,
+   or one for four columns. Unlike above, squares are better made anew than read. */
+#define MULTIPLY_PACKED(name, NUMBER) \
+  static void name(const real *w, const real *x, real *z, long m, long k, long n) { \
+    long i, j, p; \
+    for (j = 0; j + 4 <= n; j += 4, x += 4 * k, z += 4 * m) { \
+      const real *panel = w, *const x1 = x + k, *const x2 = x + 2 * k, *const x3 = x + 3 * k; \
+      for (i = 0; i < m; i += PANEL) { \
+        row_vec a = {0}, b = {0}, c = {0}, d = {0}; \
+        for (p = 0; p < k; ++p, panel += PANEL) { \
+          const row_vec row = NUMBER(panel); \
+          a += row * x[p]; \
+          b += row * x1[p]; \
+          c += row * x2[p]; \
+          d += row * x3[p]; \
+        } \
+        put_rows(z + i, a, m - i); \
+        put_rows(z + m + i, b, m - i); \
+        put_rows(z + 2 * m + i, c, m - i); \
+        put_rows(z + 3 * m + i, d, m - i); \
+      } \
+    } \
+    for (; j < n; ++j, x += k, z += m) { \
+      const real *panel = w; \
+      const long size = PANEL * k; \
+      for (i = 0; i + 3 * PANEL < m; i += 4 * PANEL, panel += 4 * size) { \
+        row_vec a = {0}, b = {0}, c = {0}, d = {0}; \
+        const real *row = panel; \
+        for (p = 0; p < k; ++p, row += PANEL) { \
+          a += NUMBER(row) * x[p]; \
+          b += NUMBER(row + size) * x[p]; \
+          c += NUMBER(row + 2 * size) * x[p]; \
+          d += NUMBER(row + 3 * size) * x[p]; \
+        } \
+        put_rows(z + i, a, m - i); \
+        put_rows(z + i + PANEL, b, m - i - PANEL); \
+        put_rows(z + i + 2 * PANEL, c, m - i - 2 * PANEL); \
+        put_rows(z + i + 3 * PANEL, d, m - i - 3 * PANEL); \
+      } \
+      for (; i < m; i += PANEL, panel += size) { \
+        row_vec a = {0}; \
+        for (p = 0; p < k; ++p) a += NUMBER(panel + p * PANEL) * x[p]; \
+        put_rows(z + i, a, m - i); \
+      } \
+    } \
   }
-  for (; j < n; ++j, x += k, z += m) {
-    const real *panel = w;
-    const long size = PANEL * k;
-    for (i = 0; i + 3 * PANEL < m; i += 4 * PANEL, panel += 4 * size) {
-      row_vec a = {0}, b = {0}, c = {0}, d = {0};
-      const real *row = panel;
-      for (p = 0; p < k; ++p, row += PANEL) {
-        a += PANEL_AT(row) * x[p];
-        b += PANEL_AT(row + size) * x[p];
-        c += PANEL_AT(row + 2 * size) * x[p];
-        d += PANEL_AT(row + 3 * size) * x[p];
-      }
-      put_rows(z + i, a, m - i);
-      put_rows(z + i + PANEL, b, m - i - PANEL);
-      put_rows(z + i + 2 * PANEL, c, m - i - 2 * PANEL);
-      put_rows(z + i + 3 * PANEL, d, m - i - 3 * PANEL);
-    }
-    for (; i < m; i += PANEL, panel += size) {
-      row_vec a = {0};
-      for (p = 0; p < k; ++p) a += PANEL_AT(panel + p * PANEL) * x[p];
-      put_rows(z + i, a, m - i);
-    }
-  }
-}
+#define ROW(p) (*(const row_vec *) (p))
+#define SQUARED_ROW(p) (ROW(p) * ROW(p))
+MULTIPLY_PACKED(multiply_packed, ROW)
+MULTIPLY_PACKED(multiply_squares, SQUARED_ROW)
 
 /* z (m, n) = x (m, k) y (k, n). */
 static void multiply(const real *x, const real *y, real *z, long m, long k, long n) {

@@ -152,6 +152,9 @@ class Program:
         """Return the transpose of a matrix (rows, columns)."""
         if rows == 1 or columns == 1:
             return matrix
+        maker = matrix.maker
+        if maker is not None and maker.code == ca.OP_SQ:  # so that it is still known to be a square
+            return self.elementwise(ca.OP_SQ, self.transpose(maker.args[0], rows, columns))
         return self.add("transpose", (matrix,), (rows, columns), [matrix.size], (rows, columns))[0]
 
     def accumulate(self, size: int, targets: Any, args: Sequence[Value], indices: Sequence[Any]) -> Value:

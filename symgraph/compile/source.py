@@ -12,7 +12,8 @@ from symgraph.compile.program import Kind, Program
 from symgraph.compile.reading import Reader
 from symgraph.compile.writing import Writer
 
-MOST_LANES = 64  # points that are evaluated side by side; more fall out of the processor's cache
+MOST_LANES = (64, 32, 16)  # points that are evaluated side by side: as many as have room in the cache
+CACHE = 6e6  # bytes of workspace that are still read fast
 
 
 def kernel_source(function: ca.Function, lanes: bool, single: bool) -> str:
@@ -23,7 +24,7 @@ def kernel_source(function: ca.Function, lanes: bool, single: bool) -> str:
         lanes: write it for points side by side, else for one at a time.
         single: compute in single precision.
     """
-    early, late = Hoister().halves(gradient_program(function))
+    early, late = Hoister(lanes).halves(gradient_program(function))
     writer = Writer()
     early_name, early_work = writer.function(early, lanes=False)
     late_name, late_work = writer.function(late, lanes=lanes)
@@ -31,7 +32,7 @@ def kernel_source(function: ca.Function, lanes: bool, single: bool) -> str:
         "N_ACTIONS": function.nnz_in(0),
         "N_SELECTIONS": function.nnz_in(1),
         "N_SHARED": function.n_in() - 2,
-        "MOST_LANES": MOST_LANES if lanes else 1,
+        "MOST_LANES": _most_lanes(late_work) if lanes else 1,
         "BLOCK": early.outputs[0].size,
         "EARLY": early_name,
         "EARLY_WORK": early_work,
@@ -48,6 +49,11 @@ def kernel_source(function: ca.Function, lanes: bool, single: bool) -> str:
         _text("kernel.c"),
     ]
     return "\n".join(parts)
+
+
+def _most_lanes(work: int) -> int:
+    fitting = [lanes for lanes in MOST_LANES if 8 * work * lanes <= CACHE]
+    return max(fitting, default=MOST_LANES[-1])
 
 
 def gradient_program(function: ca.Function) -> Program:

@@ -217,9 +217,9 @@ class _FunctionWriter:
         )
 
     def _write_packed_product(self, operation: Operation) -> None:
-        m, k, n = operation.detail
+        m, k, n, squared = operation.detail
         pointers = ", ".join(map(self._pointer, (*operation.args, *operation.outputs)))
-        do = "multiply_packed_lanes" if self._lanes else "multiply_packed"
+        do = "multiply_packed_lanes" if self._lanes else ("multiply_squares" if squared else "multiply_packed")
         self._lines.append(f"  {do}({pointers}, {m}, {k}, {n}{', B' if self._lanes else ''});")
 
     def _write_accumulate(self, operation: Operation) -> None:
