@@ -15,6 +15,7 @@ weighs them.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -28,7 +29,7 @@ from symgraph.constraints import Constraint, constraints_of, merit
 from symgraph.model import Parameter
 from symgraph.requirement import deviation
 from symgraph.slots import Gaussian, State
-from symgraph.structure import Structure, is_open
+from symgraph.structure import Chain, Structure, is_open
 from symgraph.tree import Tree, TreeBranch, TreeGroup
 
 # Scalar instructions up to which an expression is flattened: flat code runs several times faster, but the C compiler's
@@ -164,7 +165,7 @@ class _Writer:
         self._inputs = inputs
         self._relaxed = relaxed
         self._risk = risk
-        self._structure = Structure(tree)
+        self._structure = Structure(tree, chains=not risk)  # a variance is no sum over rounds
         self._functions: dict[tuple[Any, ...], ca.Function] = {}
 
     def run(self) -> Expectation:
@@ -252,6 +253,13 @@ class _Writer:
         for index in order:
             here = dictionaries.pop(index)
             groups[index], margins[index] = [], []
+            chain = self._chain_from(index, here)
+            if chain is not None:
+                instructions = math.inf
+                reach, gained, dictionaries[chain.end] = self._fold(index, chain, here)
+                order.append(chain.end)
+                groups[index] = [[(1.0, _Worth(gained, ca.MX(0.0), []))], [(reach, chain.end)]]
+                continue
             for requirement in self._tree.nodes[index].requirements:
                 outcome, count = _apply(requirement.model, here)
                 instructions += count
@@ -292,6 +300,116 @@ class _Writer:
                 total.add(_mixed([(p, worths.pop(term) if isinstance(term, int) else term) for p, term in terms]))
             worths[index] = total
         return worths[root], instructions
+
+    def _chain_from(self, index: int, here: Dictionary) -> Chain | None:
+        """Return the chain that begins at a node, if it can be written as one round again and again."""
+        chain = self._structure.chains.get(index)
+        if chain is None:
+            return None
+        # What is uncertain must be so after a round too, or rounds differ.
+        needed = self._structure.reads(index) | self._structure.reads(chain.end)
+        before = after = frozenset(label for label, g in here.items() if g.covariance.nnz())
+        for model in self._models_of(chain):
+            after = (after - set(model.writes)) | model.spread(after)
+        return chain if before & needed == after & needed else None
+
+    def _models_of(self, chain: Chain) -> list[BoundModel]:
+        """Return the models by which a round leads to the next one."""
+        branches = [self._tree.nodes[node].groups[g].branches[b].branch for node, g, b in chain.steps]
+        return [branch.model for branch in branches if branch.model is not None]
+
+    def _fold(self, index: int, chain: Chain, here: Dictionary) -> tuple[ca.MX, ca.MX, Dictionary]:
+        """Write a chain.
+
+        Of rounds k with own rewards r_k and the probability p_k of going on, Σ_k r_k Π_{i<k} p_i is carried along. The
+        function of 2n rounds calls that of n twice, so that a chain takes few functions, however long it is.
+
+        Returns:
+            the probability that all go on, the expected rewards until then, the dictionary at the end.
+        """
+        slots = self._tree.graph.slots
+        written = {label for model in self._models_of(chain) for label in model.writes}
+        labels = sorted(self._structure.reads(index) | self._structure.reads(chain.end))
+        uncertain = {label for label in labels if label in here and here[label].covariance.nnz()}
+
+        def moments(of: Dictionary, wanted: bool) -> list[ca.MX]:
+            """Return what rounds change, or what they leave; what nobody has read yet may not exist."""
+            parts = []
+            for label in labels:
+                if (label in written) == wanted:
+                    known = of.get(label, Gaussian(ca.MX(slots[label].size, 1)))
+                    parts.append(ca.densify(known.mean))
+                    parts += [ca.densify(known.covariance)] if label in uncertain else []
+            return parts
+
+        start = {label: g for label, g in self._inputs.root.items() if not isinstance(slots[label], State)}
+        for label in labels:
+            n = slots[label].size
+            spread = ca.MX.sym(label, n, n) if label in uncertain else None
+            start[label] = Gaussian(ca.MX.sym(label, n), spread)
+        share, gained = ca.MX.sym("share"), ca.MX.sym("gained")
+        goes_on, own, after = self._round(chain, start)
+        constant = [*moments(start, False), *self._shared_symbols]
+        inputs = [share, gained, *moments(start, True), *constant]
+        results = [share * goes_on, gained + share * own, *moments(after, True)]
+        by = 2 if self._relaxed else 1
+        follows = [True] * (len(inputs) - len(self._shared_symbols) + by)
+        follows += [False] * (len(self._shared_symbols) - by)
+        options: dict[str, Any] = {"cse": True, "is_diff_in": follows}
+        function = ca.Function("round", inputs, results, options)
+        with contextlib.suppress(RuntimeError):  # it calls what SX cannot hold
+            function = function.expand()
+        reached = [ca.MX(1.0), ca.MX(0.0), *moments(here, True)]
+        shared = [*moments(here, False), *self._shared_symbols]
+        rounds, count = chain.rounds, 1
+        while rounds:
+            if rounds % 2:
+                reached = function.call([*reached, *shared])
+            rounds, count = rounds // 2, 2 * count
+            if rounds:
+                twice = function.call([*function.call(inputs), *constant])
+                function = ca.Function(f"rounds_{count}", inputs, twice, options)
+        share, gained, *rest = reached
+        end = dict(here)
+        for label in labels:
+            if label in written:
+                mean = rest.pop(0)
+                end[label] = Gaussian(mean, rest.pop(0) if label in uncertain else None)
+        return share, gained, end
+
+    def _round(self, chain: Chain, here: Dictionary) -> tuple[ca.MX, ca.MX, Dictionary]:
+        """Write one round: the probability of going on, what it gains until then, and what it leads to."""
+        goes_on, gained = ca.MX(1.0), ca.MX(0.0)
+        for index, onward_group, onward_branch in chain.steps:
+            own, after = _Worth(ca.MX(0.0), ca.MX(0.0), []), here
+            probability: ca.MX | float = 1.0
+            for g, group in enumerate(self._tree.nodes[index].groups):
+                terms: list[tuple[ca.MX | float, _Worth]] = []
+                for b, (share, branch, written) in enumerate(self._outcomes(group, here)):
+                    if (g, b) == (onward_group, onward_branch):
+                        probability, after = share, {**here, **written}
+                    elif branch.child is None:
+                        terms.append((share, _Worth(written[REWARD].mean, ca.MX(0.0), [])))
+                    elif self._structure.apart[branch.child]:
+                        function, arguments = self._call(branch, here)
+                        terms.append((share, self._worth_of(function.call(arguments))))
+                    else:
+                        terms.append((share, self._worth(branch.child, {**here, **written})[0]))
+                own.add(_mixed(terms))
+            gained += goes_on * own.value
+            goes_on, here = goes_on * probability, after
+        return goes_on, gained, here
+
+    def _outcomes(self, group: TreeGroup, here: Dictionary) -> list[tuple[ca.MX | float, TreeBranch, Dictionary]]:
+        """Return each branch of a group that is no open choice, with its probability and what it writes."""
+        model = group.group.probability
+        shares, _ = _apply(model if isinstance(model, BoundModel) else None, here)
+        outcomes: list[tuple[ca.MX | float, TreeBranch, Dictionary]] = []
+        for branch in group.branches:
+            label = branch.branch.label
+            share = shares[label].mean if label in shares else branch.share
+            outcomes.append((1.0 if share is None else share, branch, _apply(branch.branch.model, here)[0]))
+        return outcomes
 
     def _results(self, worth: _Worth) -> list[ca.MX]:
         """Return what a function of a branch hands on: value, variance if it is asked for, margins if there are any."""

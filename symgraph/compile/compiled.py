@@ -22,6 +22,7 @@ from symgraph.compile.toolchain import load
 from symgraph.slots import Array, Choices
 
 SLICE = 0.05  # seconds of a search between two looks at what the user wants
+FIRST_ROUNDS = 16  # gradients before the first one
 ALIGNMENT = 64  # bytes: a cache line, and the longest vector
 HEAVY = 256  # weights from which on single points have a kernel of their own
 
@@ -214,13 +215,13 @@ class _BoundCompiled(BoundKernel):
         def work(search: Array, workspace: int) -> None:
             code.symgraph_advance(address(search), inputs.shared, workspace, rounds)
 
-        rounds, waiting, over = 1, np.ones(count, dtype=bool), False
+        rounds, waiting, over = FIRST_ROUNDS, np.ones(count, dtype=bool), False
         while waiting.any() and not over:
             begin = perf_counter()
             over = bool(stop) and not waiting.all()  # one last round, in which walks that are under way end
             rounds = 1 if over else rounds
             _side_by_side(work, list(zip(searches, inputs.work, strict=True)))
-            rounds = max(1, min(2 * rounds, int(rounds * SLICE / max(perf_counter() - begin, 1e-9))))
+            rounds = max(1, min(4 * rounds, int(rounds * SLICE / max(perf_counter() - begin, 1e-9))))
             for p in np.flatnonzero(waiting & (outcomes != _UNDER_WAY)):
                 waiting[p] = False
                 outcome, history = _OUTCOMES[outcomes[p]], histories[p, : spent[p]].copy()
@@ -229,6 +230,9 @@ class _BoundCompiled(BoundKernel):
 
 def _side_by_side(work: Callable[..., None], arguments: list[tuple[Any, ...]]) -> None:
     """Call a function with each of several arguments, in threads of their own; return when all are done."""
+    if len(arguments) == 1:
+        work(*arguments[0])
+        return
     futures = [_pool(len(arguments)).submit(work, *given) for given in arguments[1:]]
     try:
         work(*arguments[0])

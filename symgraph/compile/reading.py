@@ -28,6 +28,7 @@ class Reader:
         self._function = function
         self._programs: dict[tuple[int, Kinds], Program] = {}
         self._sites = _call_sites(function)
+        self._lengths: dict[int, int] = {}
 
     def program(self, kinds: Sequence[Kind], function: ca.Function | None = None) -> Program:
         """Return the program of a function, given what its inputs follow from."""
@@ -61,7 +62,7 @@ class Reader:
         if rule is not None:
             return _write_ruled(program, function, rule, args)
         if function.is_a("SXFunction") or function.is_a("MXFunction"):
-            if self._sites[hash(function)] <= 1 or function.n_instructions() <= INLINED:
+            if self._sites[hash(function)] <= 1 or self._length(function) <= INLINED:
                 return self.write(program, function, args)
             return list(program.add("call", tuple(args), self.program(kinds, function), sizes, hash(function)))
         if function.class_name() == "Switch" and args[0].kind < Kind.LANE:
@@ -81,6 +82,14 @@ class Reader:
             detail = (self.program(kinds, inner), times)
             return list(program.add("repeat", tuple(args), detail, sizes, (hash(inner), times)))
         return list(program.add("external", tuple(args), function, sizes, hash(function)))
+
+    def _length(self, function: ca.Function) -> int:
+        """Return how many instructions a function comes to with all that it calls."""
+        key = hash(function)
+        if key not in self._lengths:
+            own = function.n_instructions() if function.is_a("SXFunction") or function.is_a("MXFunction") else INLINED
+            self._lengths[key] = own + sum(map(self._length, _called_by(function)))
+        return self._lengths[key]
 
 
 def _call_sites(function: ca.Function) -> Counter[int]:
