@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 from known_optima import KNOWN
 from small_tasks import fork, objective_of, over_box, refuses
-from wrapped_kernels import Interrupting
+from wrapped_kernels import InterruptedLater, Interrupting, wrap_kernels
 
 import symgraph as sg
+from symgraph.compile import compiled as compiled_module
+from symgraph.compile.compiled import CompiledKernel
 from symgraph.compile.interpreted import InterpretedKernel
 
 
@@ -115,10 +117,7 @@ def test_a_constant_objective_is_converged_at_once():
 
 
 def test_ctrl_c_keeps_the_finished_runs(monkeypatch):
-    original = InterpretedKernel.bind
-    monkeypatch.setattr(
-        InterpretedKernel, "bind", lambda self, *given: Interrupting(original(self, *given), "climb", 4)
-    )
+    wrap_kernels(monkeypatch, InterpretedKernel, lambda kernel: Interrupting(kernel, "climb", 4))
     plan = sg.solve(over_box(lambda u: -((u - 0.3) ** 2), 0.0, 1.0), {}, sg.Lbfgs(starts=16))
     assert len(plan.runs) == 3
     assert plan.status == "interrupted: best of 3 runs"
@@ -126,12 +125,30 @@ def test_ctrl_c_keeps_the_finished_runs(monkeypatch):
 
 
 def test_ctrl_c_before_anything_is_finished_is_ctrl_c(monkeypatch):
-    original = InterpretedKernel.bind
-    monkeypatch.setattr(
-        InterpretedKernel, "bind", lambda self, *given: Interrupting(original(self, *given), "climb", 1)
-    )
+    wrap_kernels(monkeypatch, InterpretedKernel, lambda kernel: Interrupting(kernel, "climb", 1))
     with pytest.raises(KeyboardInterrupt):
         sg.solve(over_box(lambda u: -(u**2), 0.0, 1.0), {})
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_ctrl_c_in_compiled_code_keeps_the_finished_runs(monkeypatch, threads):
+    wrap_kernels(monkeypatch, CompiledKernel, lambda kernel: InterruptedLater(kernel, "climb", 0.3))
+    objective = over_box(lambda u: ca.sumsqr(ca.sin(ca.DM(range(2000)) * u)), -1.0, 1.0, compiled=True)
+    plan = sg.solve(objective, {}, sg.Lbfgs(starts=20_000, samples=1, tolerance=0.0), threads=threads)
+    assert 1 <= len(plan.runs) < 20_000
+    assert plan.status == f"interrupted: best of {len(plan.runs)} runs"
+    assert plan.value == max(run.value for run in plan.runs)
+
+
+def test_threads_and_slices_of_time_change_nothing(monkeypatch):
+    """Points, values, histories and the order of runs."""
+    objective = fork(lambda u: {"y": ca.sin(9 * u)}, lambda u: {"y": ca.cos(9 * u)}, compiled=True)
+    plans = []
+    for seconds, threads in ((1e-7, 1), (10.0, 1), (1e-7, 2), (10.0, 2)):
+        monkeypatch.setattr(compiled_module, "SLICE", seconds)
+        plan = sg.solve(objective, {}, sg.Lbfgs(starts=150), seed=2, threads=threads)
+        plans.append(plan.to_dict() | {"seconds": 0})
+    assert all(plan == plans[0] for plan in plans)
 
 
 def test_more_combinations_than_starts_are_improved_by_neighbours():

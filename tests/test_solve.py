@@ -1,15 +1,11 @@
 """solve: from an objective and a state to a plan, with any optimizer."""
 
-import os
-
 import casadi as ca
 import numpy as np
 import pytest
 from small_tasks import assert_close, fork, objective_of, over_box, refuses
-from wrapped_kernels import Deadly
 
 import symgraph as sg
-from symgraph.compile.interpreted import InterpretedKernel
 
 OPTIMIZERS = [sg.Lbfgs(), sg.Adadelta(), sg.Adadelta.paper(), sg.Ipopt()]
 NAMES = ["Lbfgs", "Adadelta", "Adadelta.paper", "Ipopt"]
@@ -345,18 +341,6 @@ def test_a_gradient_that_is_never_finite(optimizer):
     else:
         words = "no start point has a finite value or gradient", "actions {'u': ", "square roots and divisions at 0"
         refuses(lambda: sg.solve(objective, {}, optimizer), sg.SolveError, *words)
-
-
-def test_nothing_finite_and_nobody_left_to_say_why(monkeypatch):
-    original = InterpretedKernel.bind
-    monkeypatch.setattr(InterpretedKernel, "bind", lambda self, *given: Deadly(original(self, *given), os.getpid()))
-    objective = over_box(lambda u: ca.sqrt(u - 5), -1.0, 1.0)
-    refuses(
-        lambda: sg.solve(objective, {}, sg.Adadelta(processes=2, polish=False)),
-        sg.SolveError,
-        "no start point was finished",
-        "lost with their worker processes",
-    )
 
 
 # Progress

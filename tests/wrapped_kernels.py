@@ -1,61 +1,62 @@
-"""Kernels that fail on purpose; in a module of their own so that worker processes can import them."""
+"""Kernels that are interrupted on purpose."""
 
-import os
 import signal
-from pathlib import Path
+import threading
+from contextlib import contextmanager
 
 from symgraph.compile.kernel import BoundKernel
 
 
-class Wrapped(BoundKernel):
-    """Does what the kernel inside does; others do something first."""
+class Interrupting(BoundKernel):
+    """As if the user pressed Ctrl-C before a method hands out its n-th start."""
 
-    def __init__(self, inner):
-        self.inner = inner
-
-    def before(self, method):
-        """Called before each method with its name."""
+    def __init__(self, inner, method, start):
+        self.inner, self.method, self.left = inner, method, start
 
     def evaluate(self, *arguments):
-        self.before("evaluate")
         return self.inner.evaluate(*arguments)
 
     def climb(self, *arguments):
-        self.before("climb")
-        return self.inner.climb(*arguments)
+        return self._handed_out("climb", arguments)
 
     def ascend(self, *arguments):
-        self.before("ascend")
-        return self.inner.ascend(*arguments)
+        return self._handed_out("ascend", arguments)
 
-
-class Interrupting(Wrapped):
-    """As if the user pressed Ctrl-C in the n-th call of a method."""
-
-    def __init__(self, inner, method, call):
-        super().__init__(inner)
-        self.method, self.calls = method, call
-
-    def before(self, method):
-        if method == self.method:
-            self.calls -= 1
-            if self.calls == 0:
+    def _handed_out(self, method, arguments):
+        for found in getattr(self.inner, method)(*arguments):
+            self.left -= method == self.method
+            if self.left == 0:
                 raise KeyboardInterrupt
+            yield found
 
 
-class Deadly(Wrapped):
-    """Kills the worker process that moves a point: each one, or only the first."""
+class InterruptedLater(Interrupting):
+    """The user does press Ctrl-C, some seconds after a method began."""
 
-    def __init__(self, inner, home, mark=None):
-        super().__init__(inner)
-        self.home, self.mark = home, mark
+    def __init__(self, inner, method, seconds):
+        super().__init__(inner, method, -1)
+        self.seconds = seconds
 
-    def before(self, method):
-        if os.getpid() == self.home or method != "ascend":
+    def _handed_out(self, method, arguments):
+        if method != self.method:
+            yield from getattr(self.inner, method)(*arguments)
             return
-        if self.mark is not None:
-            try:
-                Path(self.mark).touch(exist_ok=False)
-            except FileExistsError:
-                return
-        os.kill(os.getpid(), signal.SIGKILL)
+        with ctrl_c_after(self.seconds):
+            yield from getattr(self.inner, method)(*arguments)
+
+
+@contextmanager
+def ctrl_c_after(seconds):
+    """The signal that Ctrl-C sends, as the terminal sends it: to the main thread, wherever that is."""
+    timer = threading.Timer(seconds, signal.pthread_kill, [threading.main_thread().ident, signal.SIGINT])
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def wrap_kernels(monkeypatch, kind, wrap):
+    """All kernels of a kind are wrapped when they are bound."""
+    original = kind.bind
+    monkeypatch.setattr(kind, "bind", lambda self, *given: wrap(original(self, *given)))

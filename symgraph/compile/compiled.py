@@ -125,7 +125,8 @@ class _Inputs:
         self._kept = [*(np.ascontiguousarray(column, dtype=library.real) for column in shared), block]
         self._pointers = (ctypes.c_void_p * len(self._kept))(*[address(column) for column in self._kept])
         self.shared = ctypes.addressof(self._pointers)
-        library.code.symgraph_bind(self.shared, address(block), address(aligned(library.early_work, library.real)))
+        early = aligned(library.early_work, library.real)
+        library.code.symgraph_bind(self.shared, address(block), address(early))
         self._workspaces = [aligned(library.work, library.real) for _ in range(threads)]
         self.work = [address(workspace) for workspace in self._workspaces]
 
