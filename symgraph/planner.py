@@ -100,6 +100,10 @@ def solve(
             raise KeyboardInterrupt
         raise SolveError(_why_not_finite(objective, situation, search))
     chosen = _names(objective, best.choices)
+    if objective.precision == "single":  # the search is over: what it found is told exactly
+        best.value = float(
+            situation.build.interpreted([best.point, objective.one_hot(chosen), *situation.shared])[0][0]
+        )
     nodes = objective.outcomes_of(situation, best.point, chosen)
     violation = float(objective.breaches(situation, best.point, objective.one_hot(chosen)).max(initial=0.0))
     status = search.status

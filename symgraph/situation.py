@@ -20,11 +20,12 @@ from symgraph.tree import Tree
 class Build:
     """All that is derived from the tree for one set of uncertain start states, each part when it is first needed."""
 
-    def __init__(self, tree: Tree, uncertain: frozenset[str], compiled: bool, risk: float) -> None:
+    def __init__(self, tree: Tree, uncertain: frozenset[str], compiled: bool, risk: float, single: bool) -> None:
         self._tree = tree
         self._uncertain = uncertain
         self._compiled = compiled
         self._risk = risk
+        self._single = single
         self.kept: dict[Any, Any] = {}  # what optimizers derive from the expression and use again
         self.lock = threading.Lock()  # of what is kept
 
@@ -60,13 +61,13 @@ class Build:
     @cached_property
     def kernel(self) -> Kernel:
         """J and its gradient at many points, compiled where that is possible."""
-        return make_kernel(self.expectation.value_function(), lambda: self.function, self._compiled)
+        return make_kernel(self.expectation.value_function(), lambda: self.function, self._compiled, self._single)
 
     @cached_property
     def merit_kernel(self) -> Kernel:
         """Likewise of the augmented Lagrangian, by which constraints are kept."""
         expectation = self.expectation
-        return make_kernel(expectation.merit_function(), expectation.merit_and_gradient, self._compiled)
+        return make_kernel(expectation.merit_function(), expectation.merit_and_gradient, self._compiled, self._single)
 
     def compile(self) -> None:
         """Make all that searches need."""

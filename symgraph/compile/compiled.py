@@ -24,6 +24,7 @@ from symgraph.slots import Array, Choices
 SLICE = 0.05  # seconds of a search between two looks at what the user wants
 FIRST_ROUNDS = 16  # gradients before the first one
 ALIGNMENT = 64  # bytes: a cache line, and the longest vector
+SINGLE_TOLERANCE = 1e4  # times those of double precision
 HEAVY = 256  # weights from which on single points have a kernel of their own
 
 _OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)  # in the order of search.c's enum
@@ -173,7 +174,9 @@ class _BoundCompiled(BoundKernel):
     def climb(
         self, starts: Array, selections: Array, iterations: int, tolerances: Array
     ) -> Iterator[tuple[int, Ended]]:
-        return self._search(starts, selections, tolerances, np.ones(len(starts)), limit=iterations)
+        # In single precision slopes are never as small as in double.
+        reachable = tolerances * (SINGLE_TOLERANCE if self._kernel.single else 1.0)
+        return self._search(starts, selections, reachable, np.ones(len(starts)), limit=iterations)
 
     def ascend(
         self, starts: Array, selections: Array, limit: int, steps: AdadeltaSteps, scales: Array

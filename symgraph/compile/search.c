@@ -27,7 +27,11 @@ static const double CURVATURE = 0.9;       /* how much flatter a step must end: 
 static const double LOOSE = 1e3;           /* times the tolerance: converged where rounding hides all further gain */
 static const int MOST_ROUNDS = 10;         /* of sending actions to their bounds */
 static const int MOST_TRIES = 50;          /* steps of one line search */
-static const double SMALLEST_GAIN = 1e-15; /* relative to the value: less cannot be told from rounding */
+#ifdef SINGLE
+static const double SMALLEST_GAIN = 1e-6; /* relative to the value: less cannot be told from rounding */
+#else
+static const double SMALLEST_GAIN = 1e-15;
+#endif
 
 /* The last steps and gradient changes, in a ring. */
 struct pairs {
