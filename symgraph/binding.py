@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 import math
 import re
@@ -53,6 +54,13 @@ class BoundModel:
         self._rule = rule
         self._noise = dict(noise)
         self._built: dict[tuple[str, ...], ca.Function] = {}
+
+    def at(self, place: str) -> BoundModel:
+        """Return the same for another place of the graph; what is built for one serves both."""
+        other = copy.copy(self)
+        other.place = f"{place}: model {self.name!r}"
+        other._built = self._built
+        return other
 
     @property
     def learner(self) -> Any:

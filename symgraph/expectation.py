@@ -297,7 +297,8 @@ class _Writer:
             total = _Worth(ca.MX(self._tree.cut_value if self._tree.nodes[index].cut else 0.0), ca.MX(0.0), [])
             total.margins += margins[index]
             for terms in groups[index]:
-                total.add(_mixed([(p, worths.pop(term) if isinstance(term, int) else term) for p, term in terms]))
+                mixed = [(p, worths.pop(term) if isinstance(term, int) else term) for p, term in terms]
+                total.add(_mixed(mixed, bool(self._risk)))
             worths[index] = total
         return worths[root], instructions
 
@@ -395,7 +396,7 @@ class _Writer:
                         terms.append((share, self._worth_of(function.call(arguments))))
                     else:
                         terms.append((share, self._worth(branch.child, {**here, **written})[0]))
-                own.add(_mixed(terms))
+                own.add(_mixed(terms, spread=False))
             gained += goes_on * own.value
             goes_on, here = goes_on * probability, after
         return goes_on, gained, here
@@ -431,7 +432,7 @@ class _Writer:
             worth = self._worth_of(function.call(arguments))
             worth.margins = [share * margin for margin in worth.margins]
             terms.append((share, worth))
-        return _mixed(terms)
+        return _mixed(terms, bool(self._risk))
 
     def _switch(self, group: TreeGroup, here: Dictionary) -> _Worth:
         """Write a choice: the function of the selected branch, the others not evaluated."""
@@ -471,15 +472,15 @@ class _Worth:
         self.margins += other.margins
 
 
-def _mixed(terms: list[tuple[ca.MX | float, _Worth]]) -> _Worth:
-    """Return the worth of a group of branches of which one happens: mean and variance of a mixture."""
+def _mixed(terms: list[tuple[ca.MX | float, _Worth]], spread: bool) -> _Worth:
+    """Return the worth of a group of branches of which one happens: mean and, if asked for, variance of a mixture."""
     margins = [margin for _, worth in terms for margin in worth.margins]
     if len(terms) == 1 and isinstance(terms[0][0], float) and terms[0][0] == 1.0:
         return _Worth(terms[0][1].value, terms[0][1].variance, margins)
     value, variance = ca.MX(0.0), ca.MX(0.0)
     for probability, worth in terms:
         value += probability * worth.value
-    for probability, worth in terms:
+    for probability, worth in terms if spread else ():
         variance += probability * (worth.variance + (worth.value - value) ** 2)
     return _Worth(value, variance, margins)
 

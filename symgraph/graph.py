@@ -62,6 +62,7 @@ class Graph:
         self.start = _node(start, "start")
         self.groups: dict[str, list[Group]] = {}  # source → its groups, in the order of the calls
         self.requirements: dict[str, list[Requirement]] = {}  # source → what must hold there
+        self._known: dict[tuple[int, str, tuple[str, ...]], tuple[Any, BoundModel]] = {}
 
     def edge(self, source: str, target: str, model: Any = None) -> None:
         """Add a group with the one branch source → target; without a model nothing changes on the way."""
@@ -123,14 +124,14 @@ class Graph:
         elif not callable(probability) and not isinstance(probability, (Model, Propagator)):
             raise GraphError(f"{place}: probability = {probability!r}; give {{branch: number}} or a model")
         else:
-            p = bind(probability, self.slots, "probability", f"{place}, probability", branches)
+            p = self._bound(probability, "probability", f"{place}, probability", tuple(branches))
         bound = [Branch(b, t, self._bind(m, f"{place}, branch {b!r}")) for b, (t, m) in branches.items()]
         self._add(source, Group("chance", tuple(bound), probability=p))
 
     def reward(self, source: str, model: Any) -> None:
         """Add a reward that is paid at a node: a model that returns one scalar."""
         source = _node(source, "source")
-        bound = bind(model, self.slots, "reward", f"node {source!r}, reward")
+        bound = self._bound(model, "reward", f"node {source!r}, reward")
         self._add(source, Group("reward", (Branch("", None, bound),)))
 
     def require(
@@ -151,7 +152,7 @@ class Graph:
         """
         source = _node(source, "source")
         place = f"node {source!r}, requirement"
-        bound = bind(model, self.slots, "requirement", place)
+        bound = self._bound(model, "requirement", place)
         checked = requirement(bound, low, high, confidence, bound.place)
         self.requirements.setdefault(source, []).append(checked)
 
@@ -230,7 +231,19 @@ class Graph:
                     yield branch.target
 
     def _bind(self, model: Any, place: str) -> BoundModel | None:
-        return None if model is None else bind(model, self.slots, "edge", place)
+        return None if model is None else self._bound(model, "edge", place)
+
+    def _bound(self, model: Any, role: str, place: str, branches: tuple[str, ...] = ()) -> BoundModel:
+        """Check a model, or take over what was found elsewhere: a large graph has the same ones many times."""
+        key = id(model), role, branches
+        if key in self._known:
+            return self._known[key][1].at(place)
+        bound = bind(model, self.slots, role, place, branches)
+        self._known[key] = model, bound  # the model is kept, so that no other one gets its id
+        return bound
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_known": {}}
 
     def _add(self, source: str, group: Group) -> None:
         self.groups.setdefault(source, []).append(group)
