@@ -92,7 +92,10 @@ class Hoister:
             # A point alone is bound by how fast weights can be read: squares are better made anew.
             squared = not self._lanes and maker is not None and maker.code == ca.OP_SQ
             left = maker.args[0] if squared and maker is not None else left
-            (packed,) = whole.add("pack", (left,), (m, k), [-(-m // PANEL) * PANEL * k], (m, k))
+            transposed = left.maker is not None and left.maker.code == "transpose"
+            left = left.maker.args[0] if transposed and left.maker is not None else left
+            shape = m, k, transposed
+            (packed,) = whole.add("pack", (left,), shape, [-(-m // PANEL) * PANEL * k], shape)
             detail = m, k, n, squared
             new[operation.outputs[0]] = whole.add("packed product", (packed, right), detail, [m * n], detail)[0]
         else:

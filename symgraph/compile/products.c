@@ -12,12 +12,16 @@
 
 typedef real row_vec __attribute__((vector_size(PANEL * sizeof(real)), aligned(sizeof(real)), may_alias));
 
-/* z (panels of PANEL rows) = x (m, k); rows beyond m are zero. */
-static void pack(const real *x, real *z, long m, long k) {
+/* z (panels of PANEL rows) = the matrix (m, k) whose numbers lie `row` and `column` apart; rows beyond m are zero. */
+static void pack(const real *x, real *z, long m, long k, long row, long column) {
   long i, p, r;
-  for (i = 0; i < m; i += PANEL)
-    for (p = 0; p < k; ++p)
-      for (r = 0; r < PANEL; ++r, ++z) *z = i + r < m ? x[i + r + p * m] : 0;
+  for (i = 0; i < m; i += PANEL, x += PANEL * row)
+    if (m - i >= PANEL)
+      for (p = 0; p < k; ++p, z += PANEL)
+        for (r = 0; r < PANEL; ++r) z[r] = x[r * row + p * column];
+    else
+      for (p = 0; p < k; ++p, z += PANEL)
+        for (r = 0; r < PANEL; ++r) z[r] = r < m - i ? x[r * row + p * column] : 0;
 }
 
 #define EACH_ROW_8(DO) DO(0) DO(1) DO(2) DO(3) DO(4) DO(5) DO(6) DO(7)

@@ -211,10 +211,9 @@ class _FunctionWriter:
             self._lines.append(f"  multiply({pointers}, {m}, {k}, {n});")
 
     def _write_pack(self, operation: Operation) -> None:
-        m, k = operation.detail
-        self._lines.append(
-            f"  pack({self._pointer(operation.args[0])}, {self._pointer(operation.outputs[0])}, {m}, {k});"
-        )
+        m, k, transposed = operation.detail
+        pointers = ", ".join(map(self._pointer, (*operation.args, *operation.outputs)))
+        self._lines.append(f"  pack({pointers}, {m}, {k}, {f'{k}, 1' if transposed else f'1, {m}'});")
 
     def _write_packed_product(self, operation: Operation) -> None:
         m, k, n, squared = operation.detail
