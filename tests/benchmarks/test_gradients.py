@@ -45,7 +45,7 @@ def evaluators(hidden, count):
 
     given = task.weights(hidden), task.state
     made = {
-        "symgraph": (0.0, symgraph(hidden)),
+        "symgraph": (AGREEMENT, symgraph(hidden)),
         "JAX": (AGREEMENT, gradients_jax.evaluator(*given)),
         "torch": (AGREEMENT, gradients_torch.evaluator(*given)),
         "torch.func": (AGREEMENT, gradients_torch.evaluator(*given, way=gradients_torch.functional)),
@@ -90,33 +90,49 @@ def seconds_per_call(function):
     return spent / calls
 
 
+class Turns:
+    """All ways to the same numbers, each of which is timed in every round.
+
+    Attributes:
+        seconds: {name: [s/point]} so far.
+        operations: of the products alone, in a point.
+    """
+
+    def __init__(self, hidden, count):
+        actions = task.points(count)
+        expected = symgraph(hidden)(actions)
+        self._count = count
+        self._functions = {}
+        for name, (tolerance, evaluate) in evaluators(hidden, count).items():
+            for one, other in zip(evaluate(actions), expected, strict=True):
+                np.testing.assert_allclose(one, other, rtol=0, atol=tolerance * np.abs(other).max(), err_msg=name)
+            self._functions[name] = partial(evaluate, actions)
+        self._functions["products alone"], self.operations = products(hidden, count)
+        self.seconds = {name: [] for name in self._functions}
+
+    def take(self):
+        for name, function in self._functions.items():
+            self.seconds[name].append(seconds_per_call(function) / self._count)
+
+    def medians(self):
+        return {name: statistics.median(times[1:]) for name, times in self.seconds.items()}
+
+
 # torch.compile reads parts of torch that torch itself has deprecated.
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("count", [1, 16, 256])
 @pytest.mark.parametrize("hidden", [LARGE, SMALL], ids=["3 x 200", "2 x 32"])
 def test_time_per_point(hidden, count, one_core, benchmark, capsys):
-    actions = task.points(count)
-    functions = {}
-    expected = symgraph(hidden)(actions)
-    for name, (tolerance, evaluate) in evaluators(hidden, count).items():
-        found = evaluate(actions)
-        for one, other in zip(found, expected, strict=True):
-            np.testing.assert_allclose(one, other, rtol=0, atol=tolerance * np.abs(other).max(), err_msg=name)
-        functions[name] = partial(evaluate, actions)
-    functions["products alone"], operations = products(hidden, count)
-    seconds = {name: [] for name in functions}
-
-    def take_turns():
-        for name, function in functions.items():
-            seconds[name].append(seconds_per_call(function) / count)
-
-    benchmark.pedantic(take_turns, rounds=ROUNDS, warmup_rounds=1)
-    median = {name: statistics.median(times[1:]) for name, times in seconds.items()}
+    turns = Turns(hidden, count)
+    benchmark.pedantic(turns.take, rounds=ROUNDS, warmup_rounds=1)
+    median = turns.medians()
     benchmark.extra_info.update({f"{name} [s/point]": time for name, time in median.items()})
     with capsys.disabled():
         print(f"\n{len(hidden)} x {hidden[0]}, {count} points")
         for name, time_per_point in median.items():
-            ratio = median["symgraph"] / time_per_point
-            print(f"  {name:15} {1e6 * time_per_point:8.1f} µs/point   symgraph takes {ratio:5.2f} times as long")
-        rate = 1e-9 * operations / median["products alone"]
-        print(f"  products: {1e-6 * operations:.2f} million operations a point, {rate:.0f} thousand million a second")
+            ratio = time_per_point / median["symgraph"]
+            print(f"  {name:18} {1e6 * time_per_point:8.1f} µs/point, {ratio:6.2f} times symgraph's")
+        rate = 1e-9 * turns.operations / median["products alone"]
+        print(
+            f"  products: {1e-6 * turns.operations:.2f} million operations a point, {rate:.0f} thousand million a second"
+        )
