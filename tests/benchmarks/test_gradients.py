@@ -133,6 +133,4 @@ def test_time_per_point(hidden, count, one_core, benchmark, capsys):
             ratio = time_per_point / median["symgraph"]
             print(f"  {name:18} {1e6 * time_per_point:8.1f} µs/point, {ratio:6.2f} times symgraph's")
         rate = 1e-9 * turns.operations / median["products alone"]
-        print(
-            f"  products: {1e-6 * turns.operations:.2f} million operations a point, {rate:.0f} thousand million a second"
-        )
+        print(f"  products: {1e-6 * turns.operations:.2f} MFLOP a point, {rate:.0f} GFLOP a second")
