@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache, cached_property
@@ -237,18 +238,26 @@ def _side_by_side(work: Callable[..., None], arguments: list[tuple[Any, ...]]) -
     if len(arguments) == 1:
         work(*arguments[0])
         return
-    futures = [_pool(len(arguments)).submit(work, *given) for given in arguments[1:]]
+    futures = [_pool(len(arguments), os.getpid()).submit(work, *given) for given in arguments[1:]]
+    interrupt: KeyboardInterrupt | None = None
     try:
         work(*arguments[0])
-    finally:  # even where the user interrupts: arrays must stay until nobody writes to them
-        wait(futures)
+    finally:
+        while not all(future.done() for future in futures):  # arrays must stay until nobody writes to them
+            try:
+                wait(futures)
+            except KeyboardInterrupt as error:
+                interrupt = error
+    if interrupt is not None:
+        raise interrupt
     for future in futures:
         future.result()
 
 
 @cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="symgraph")
+def _pool(threads: int, process: int) -> ThreadPoolExecutor:
+    """Return threads; a forked process has none of its parent's."""
+    return ThreadPoolExecutor(threads, thread_name_prefix=f"symgraph-{process}")
 
 
 def _by_selection(selections: Array) -> Choices | None:

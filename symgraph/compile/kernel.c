@@ -70,7 +70,10 @@ void symgraph_evaluate(long long count, const double *points, const double *chos
   while (p < count) {
     long n = 1, b, i, B;
     if (p && *stop) {
-      for (; p < count; ++p) values[p] = NAN;
+      for (; p < count; ++p) {
+        values[p] = NAN;
+        for (i = 0; i < N_ACTIONS; ++i) gradients[p * N_ACTIONS + i] = NAN;
+      }
       return;
     }
     while (n < MOST_LANES && p + n < count &&

@@ -62,7 +62,7 @@ static real s_erfinv(real x) {
   y = copysign(sqrt(sqrt(b * b - a / 0.147) - b), (double) x);
   for (i = 0; i < 3; ++i) {
     double error = (x < 0 ? erfc(-y) - (1 + (double) x) : (1 - (double) x) - erfc(y)), slope = 1.1283791670955126 * exp(-y * y);
-    double step = (x < 0 ? -error : -error) / slope;
+    double step = error / slope;
     y -= step / (1 + y * step);
   }
   return (real) y;

@@ -104,8 +104,10 @@ class Program:
 
     def elementwise(self, code: int, *args: Value) -> Value:
         """Return the result of a scalar operation on each number; arguments of size 1 serve all numbers of others."""
-        args = tuple(self._single(arg) for arg in args)
         size = max(arg.size for arg in args) if all(arg.size for arg in args) else 0
+        args = tuple(self._single(arg) for arg in args)
+        if size > 1 and all(arg.size == 1 for arg in args):  # they were all constants, and all alike
+            return self.gather([self.elementwise(code, *args)], np.zeros(size))
         simple = self._simplified(code, args, size)
         return self.add(code, args, None, [size])[0] if simple is None else simple
 
