@@ -52,7 +52,7 @@ class Parameter:
 
     @property
     def value(self) -> Array:
-        """The numbers, in the shape of the symbol; set it to change them."""
+        """The numbers, in the shape of the symbol; set it to change them, since they cannot be changed in place."""
         return self._value
 
     @value.setter
@@ -67,6 +67,7 @@ class Parameter:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
+        self._value.flags.writeable = False
         self.symbol = ca.MX.sym(self.name, *self._value.shape)
 
     def _checked(self, value: Any) -> Array:
@@ -75,7 +76,10 @@ class Parameter:
             raise SlotError(f"parameter {self.name!r} has shape {numbers.shape}; give a number, a column or a matrix")
         if not np.isfinite(numbers).all():
             raise SlotError(f"parameter {self.name!r}: the value is not finite")
-        return numbers.reshape(-1, 1) if numbers.ndim < 2 else numbers
+        # In CasADi's order, and not to be changed in place: kernels keep what follows from the numbers.
+        matrix = np.asfortranarray(numbers.reshape(-1, 1) if numbers.ndim < 2 else numbers)
+        matrix.flags.writeable = False
+        return matrix
 
 
 class Model:

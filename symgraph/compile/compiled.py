@@ -26,6 +26,7 @@ SLICE = 0.05  # seconds of a search between two looks at what the user wants
 FIRST_ROUNDS = 16  # gradients before the first one
 ALIGNMENT = 64  # bytes: a cache line, and the longest vector
 SINGLE_TOLERANCE = 1e4  # times those of double precision
+FEW = 1000  # numbers that are compared one by one
 HEAVY = 256  # weights from which on single points have a kernel of their own
 
 _OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)  # in the order of search.c's enum
@@ -48,6 +49,7 @@ class CompiledKernel(Kernel):
         self.function = function
         self.single = single
         self._compiler = compiler
+        self._prepared: dict[int, _Prepared] = {}
         self.n_actions, self.n_selections = function.numel_in(0), function.numel_in(1)
         # A point alone leaves most of a vector empty, which matters where there are matrices of weights.
         self._heavy = any(function.numel_in(i) >= HEAVY for i in range(2, function.n_in()))
@@ -66,6 +68,13 @@ class CompiledKernel(Kernel):
     def library(self, count: int) -> Library:
         """Return the code that is best for so many points."""
         return self.narrow if count == 1 else self.wide
+
+    def prepared(self, library: Library, columns: Sequence[Array]) -> _Prepared:
+        """Return what follows from bound inputs; the last of them is kept, since many calls come with the same ones."""
+        last = self._prepared.get(id(library))
+        if last is None or not last.serves(columns):
+            last = self._prepared[id(library)] = _Prepared(library, columns)
+        return last
 
     def __reduce__(self) -> tuple[Any, ...]:  # other processes load the libraries from the cache
         return CompiledKernel, (self.function, self._compiler, self.single)
@@ -118,17 +127,33 @@ class _Settings(ctypes.Structure):
     )
 
 
-class _Inputs:
-    """Bound inputs of a library, what follows from them, and workspace for each thread."""
+class _Prepared:
+    """Bound inputs of a library, and what follows from them; only read from here on, by any thread."""
 
-    def __init__(self, library: Library, shared: Sequence[Array], threads: int) -> None:
-        self.library = library
-        block = aligned(library.block, library.real)
-        self._kept = [*(np.ascontiguousarray(column, dtype=library.real) for column in shared), block]
+    def __init__(self, library: Library, columns: Sequence[Array]) -> None:
+        self._columns = columns
+        block, early = aligned(library.block, library.real), aligned(library.early_work, library.real)
+        self._kept = [*(np.ascontiguousarray(column, dtype=library.real) for column in columns), block]
         self._pointers = (ctypes.c_void_p * len(self._kept))(*[address(column) for column in self._kept])
-        self.shared = ctypes.addressof(self._pointers)
-        early = aligned(library.early_work, library.real)
-        library.code.symgraph_bind(self.shared, address(block), address(early))
+        self.address = ctypes.addressof(self._pointers)
+        library.code.symgraph_bind(self.address, address(block), address(early))
+
+    def serves(self, columns: Sequence[Array]) -> bool:
+        """Whether other inputs are the same: the same memory, which nobody can change, or the same few numbers."""
+        return all(
+            (address(a) == address(b) and a.size == b.size and not (a.flags.writeable or b.flags.writeable))
+            or (a.size == b.size <= FEW and a.tobytes() == b.tobytes())
+            for a, b in zip(columns, self._columns, strict=True)
+        )
+
+
+class _Inputs:
+    """What a library needs to evaluate: bound inputs, and workspace for each thread."""
+
+    def __init__(self, library: Library, prepared: _Prepared, threads: int) -> None:
+        self.library = library
+        self._prepared = prepared
+        self.shared = prepared.address
         self._workspaces = [aligned(library.work, library.real) for _ in range(threads)]
         self.work = [address(workspace) for workspace in self._workspaces]
 
@@ -148,7 +173,8 @@ class _BoundCompiled(BoundKernel):
     def _for(self, count: int) -> _Inputs:
         library = self._kernel.library(count)
         if id(library) not in self._inputs:
-            self._inputs[id(library)] = _Inputs(library, self._given[0], self._threads)
+            prepared = self._kernel.prepared(library, self._given[0])
+            self._inputs[id(library)] = _Inputs(library, prepared, self._threads)
         return self._inputs[id(library)]
 
     def evaluate(self, actions: Array, selections: Array) -> tuple[Array, Array]:
@@ -235,8 +261,9 @@ class _BoundCompiled(BoundKernel):
 
 def _side_by_side(work: Callable[..., None], arguments: list[tuple[Any, ...]]) -> None:
     """Call a function with each of several arguments, in threads of their own; return when all are done."""
-    if len(arguments) == 1:
-        work(*arguments[0])
+    if len(arguments) <= 1:
+        for given in arguments:
+            work(*given)
         return
     futures = [_pool(len(arguments), os.getpid()).submit(work, *given) for given in arguments[1:]]
     interrupt: KeyboardInterrupt | None = None
