@@ -15,7 +15,6 @@ weighs them.
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -35,6 +34,8 @@ from symgraph.tree import Tree, TreeBranch, TreeGroup
 # Scalar instructions up to which an expression is flattened: flat code runs several times faster, but the C compiler's
 # time grows faster than its length.
 FLATTEN_LIMIT = 5_000
+
+MOST_REFUSED = 64  # rounds written out one by one until what is uncertain is the same after each
 
 Dictionary = dict[str, Gaussian]  # the super-state-action dictionary of a node: label → Gaussian of MX
 
@@ -154,19 +155,28 @@ def expected_value(tree: Tree, uncertain: frozenset[str], relaxed: bool = False,
 
     Source: Yamaguchi & Atkeson, Humanoids 2016, equations (1)–(4).
     """
-    return _Writer(tree, Inputs(tree, uncertain), relaxed, risk).run()
+    inputs = Inputs(tree, uncertain)
+    try:
+        return _Writer(tree, inputs, relaxed, risk, chains=not risk).run()  # a variance is no sum over rounds
+    except _Unsteady:
+        return _Writer(tree, inputs, relaxed, risk, chains=False).run()
+
+
+class _Unsteady(Exception):
+    """What is uncertain goes on changing from round to round, so that chains cannot be folded."""
 
 
 class _Writer:
     """Writes the expression: dictionaries from the root to the leaves, values from the leaves to the root."""
 
-    def __init__(self, tree: Tree, inputs: Inputs, relaxed: bool, risk: float) -> None:
+    def __init__(self, tree: Tree, inputs: Inputs, relaxed: bool, risk: float, chains: bool) -> None:
         self._tree = tree
         self._inputs = inputs
         self._relaxed = relaxed
         self._risk = risk
-        self._structure = Structure(tree, chains=not risk)  # a variance is no sum over rounds
+        self._structure = Structure(tree, chains)
         self._functions: dict[tuple[Any, ...], ca.Function] = {}
+        self._refused = 0  # chains in which one round leaves other labels uncertain than the one before
 
     def run(self) -> Expectation:
         # Functions are written before those that call them: leaves first. For that, a first pass finds what is
@@ -275,9 +285,7 @@ class _Writer:
                 shares, count = _apply(model if isinstance(model, BoundModel) else None, here)
                 instructions += count
                 for branch in group.branches:
-                    label = branch.branch.label
-                    share = shares[label].mean if label in shares else branch.share
-                    probability = 1.0 if share is None else share
+                    probability = _share(branch, shares)
                     if branch.child is not None and self._structure.apart[branch.child]:
                         instructions = math.inf
                         function, arguments = self._call(branch, here)
@@ -312,7 +320,12 @@ class _Writer:
         before = after = frozenset(label for label, g in here.items() if g.covariance.nnz())
         for model in self._models_of(chain):
             after = (after - set(model.writes)) | model.spread(after)
-        return chain if before & needed == after & needed else None
+        if before & needed == after & needed:
+            return chain
+        self._refused += 1
+        if self._refused > MOST_REFUSED:
+            raise _Unsteady
+        return None
 
     def _models_of(self, chain: Chain) -> list[BoundModel]:
         """Return the models by which a round leads to the next one."""
@@ -349,7 +362,7 @@ class _Writer:
             spread = ca.MX.sym(label, n, n) if label in uncertain else None
             start[label] = Gaussian(ca.MX.sym(label, n), spread)
         share, gained = ca.MX.sym("share"), ca.MX.sym("gained")
-        goes_on, own, after = self._round(chain, start)
+        goes_on, own, after, instructions = self._round(chain, start)
         constant = [*moments(start, False), *self._shared_symbols]
         inputs = [share, gained, *moments(start, True), *constant]
         results = [share * goes_on, gained + share * own, *moments(after, True)]
@@ -358,7 +371,7 @@ class _Writer:
         follows += [False] * (len(self._shared_symbols) - by)
         options: dict[str, Any] = {"cse": True, "is_diff_in": follows}
         function = ca.Function("round", inputs, results, options)
-        with contextlib.suppress(RuntimeError):  # it calls what SX cannot hold
+        if instructions <= FLATTEN_LIMIT:
             function = function.expand()
         reached = [ca.MX(1.0), ca.MX(0.0), *moments(here, True)]
         shared = [*moments(here, False), *self._shared_symbols]
@@ -378,39 +391,38 @@ class _Writer:
                 end[label] = Gaussian(mean, rest.pop(0) if label in uncertain else None)
         return share, gained, end
 
-    def _round(self, chain: Chain, here: Dictionary) -> tuple[ca.MX, ca.MX, Dictionary]:
-        """Write one round: the probability of going on, what it gains until then, and what it leads to."""
-        goes_on, gained = ca.MX(1.0), ca.MX(0.0)
+    def _round(self, chain: Chain, here: Dictionary) -> tuple[ca.MX, ca.MX, Dictionary, float]:
+        """Write one round: the probability of going on, what it gains, what it leads to; also its instructions."""
+        goes_on, gained, instructions = ca.MX(1.0), ca.MX(0.0), 0.0
         for index, onward_group, onward_branch in chain.steps:
             own, after = _Worth(ca.MX(0.0), ca.MX(0.0), []), here
             probability: ca.MX | float = 1.0
             for g, group in enumerate(self._tree.nodes[index].groups):
                 terms: list[tuple[ca.MX | float, _Worth]] = []
-                for b, (share, branch, written) in enumerate(self._outcomes(group, here)):
+                model = group.group.probability
+                shares, count = _apply(model if isinstance(model, BoundModel) else None, here)
+                instructions += count
+                for b, branch in enumerate(group.branches):
+                    share = _share(branch, shares)
+                    if branch.child is not None and self._structure.apart[branch.child]:
+                        function, arguments = self._call(branch, here)
+                        terms.append((share, self._worth_of(function.call(arguments))))
+                        instructions = math.inf
+                        continue
+                    written, count = _apply(branch.branch.model, here)
+                    instructions += count + 2
                     if (g, b) == (onward_group, onward_branch):
                         probability, after = share, {**here, **written}
                     elif branch.child is None:
                         terms.append((share, _Worth(written[REWARD].mean, ca.MX(0.0), [])))
-                    elif self._structure.apart[branch.child]:
-                        function, arguments = self._call(branch, here)
-                        terms.append((share, self._worth_of(function.call(arguments))))
                     else:
-                        terms.append((share, self._worth(branch.child, {**here, **written})[0]))
+                        worth, count = self._worth(branch.child, {**here, **written})
+                        terms.append((share, worth))
+                        instructions += count
                 own.add(_mixed(terms, spread=False))
             gained += goes_on * own.value
             goes_on, here = goes_on * probability, after
-        return goes_on, gained, here
-
-    def _outcomes(self, group: TreeGroup, here: Dictionary) -> list[tuple[ca.MX | float, TreeBranch, Dictionary]]:
-        """Return each branch of a group that is no open choice, with its probability and what it writes."""
-        model = group.group.probability
-        shares, _ = _apply(model if isinstance(model, BoundModel) else None, here)
-        outcomes: list[tuple[ca.MX | float, TreeBranch, Dictionary]] = []
-        for branch in group.branches:
-            label = branch.branch.label
-            share = shares[label].mean if label in shares else branch.share
-            outcomes.append((1.0 if share is None else share, branch, _apply(branch.branch.model, here)[0]))
-        return outcomes
+        return goes_on, gained, here, instructions
 
     def _results(self, worth: _Worth) -> list[ca.MX]:
         """Return what a function of a branch hands on: value, variance if it is asked for, margins if there are any."""
@@ -483,6 +495,13 @@ def _mixed(terms: list[tuple[ca.MX | float, _Worth]], spread: bool) -> _Worth:
     for probability, worth in terms if spread else ():
         variance += probability * (worth.variance + (worth.value - value) ** 2)
     return _Worth(value, variance, margins)
+
+
+def _share(branch: TreeBranch, shares: Dictionary) -> ca.MX | float:
+    """Return the probability of a branch, given what the group's model returned."""
+    label = branch.branch.label
+    share = shares[label].mean if label in shares else branch.share
+    return 1.0 if share is None else share
 
 
 def _apply(model: BoundModel | None, here: Dictionary) -> tuple[Dictionary, float]:

@@ -126,6 +126,7 @@ class _Chains:
         self._next: dict[int, tuple[int, int, int]] = {}  # group, branch and child with the largest subtree
         self._does: dict[int, tuple[Any, ...]] = {}  # what a node does, but for where that leads
         below = [1] * len(tree.nodes)  # nodes of the subtree
+        required = [bool(node.requirements) for node in tree.nodes]  # whether it holds a requirement
         for node in reversed(tree.nodes):
             children = [
                 (below[branch.child], g, b, branch.child)
@@ -134,7 +135,10 @@ class _Chains:
                 if branch.child is not None
             ]
             below[node.index] += sum(size for size, *_ in children)
-            if children and not node.requirements and not any(is_open(group) for group in node.groups):
+            aside = [required[child] for *_, child in sorted(children)[:-1]]
+            plain = not node.requirements and not any(aside) and not any(is_open(group) for group in node.groups)
+            required[node.index] |= any(required[child] for *_, child in children)
+            if children and plain:
                 _, g, b, child = max(children)
                 self._next[node.index] = g, b, child
                 self._does[node.index] = (g, b, *_doings(node, kinds, child))
@@ -171,5 +175,5 @@ class _Chains:
 def _doings(node: TreeNode, kinds: list[int], following: int) -> Iterator[tuple[Any, ...]]:
     for group in node.groups:
         for branch in group.branches:
-            below = branch.child is None if branch.child in (None, following) else kinds[branch.child]
+            below = "end" if branch.child is None else "on" if branch.child == following else kinds[branch.child]
             yield id(group.group), id(branch.branch), branch.share, below

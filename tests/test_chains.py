@@ -1,5 +1,8 @@
 """Chains: rounds through the same nodes, folded into one function, against all of them written out."""
 
+import inspect
+import itertools
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -110,6 +113,54 @@ def test_requirements_at_each_visit_write_them_out():
     tree = task(40)
     tree.graph.require("here", lambda x: x[0], high=2.0)
     assert not structure.Structure(sg.unroll(tree.graph, max_visits=40)).chains
+
+
+def test_requirements_aside_write_them_out():
+    """Their margins belong to each visit."""
+    graph = task(40, aside=True).graph
+    graph.require("look", lambda seen: seen, high=0.5)
+    tree = sg.unroll(graph, max_visits=40)
+    assert not structure.Structure(tree).chains
+    plan = sg.solve(sg.Objective(tree), STATE, sg.Lbfgs(starts=2, iterations=20))
+    assert plan.violation > 0.1  # the cosine is near 1
+
+
+def test_a_choice_aside_evaluates_what_is_chosen_alone():
+    slots = {
+        "x": sg.State(),
+        "y": sg.State(),
+        "push": sg.Action(low=-1, high=1),
+        "way": sg.Selection(["plain", "root"]),
+    }
+    graph = sg.Graph(slots, start="here")
+    graph.edge("here", "here", lambda x, push: {"x": 0.9 * x + push})
+    graph.edge("here", "fork")
+    ways = {"plain": ("end", lambda x: {"y": x}), "root": ("end", lambda x: {"y": ca.sqrt(x - 99)})}
+    graph.choose("fork", "way", ways)
+    graph.reward("end", lambda y: -(y**2))
+    tree = sg.unroll(graph, max_visits=40)
+    assert structure.Structure(tree).chains
+    objective = sg.Objective(tree)
+    values, gradients = objective.evaluate({"x": 0.3}, [[0.2, -0.1]], {"way": "plain"})
+    assert np.isfinite(values).all()
+    assert np.isfinite(gradients).all()
+
+
+def test_what_goes_on_growing_uncertain_is_written_out():
+    """From round to round one more label is uncertain."""
+    labels = [f"x{i}" for i in range(70)]
+    slots = {label: sg.State() for label in labels} | {"u": sg.Action(low=-1, high=1)}
+
+    def shift(**x):
+        return {label: x[before] for before, label in itertools.pairwise(labels)} | {"x0": x["x0"] * 0.9}
+
+    shift.__signature__ = inspect.Signature([inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY) for n in labels])
+    graph = sg.Graph(slots, start="here")
+    graph.edge("here", "here", shift)
+    graph.reward("here", lambda x69, u: -(x69**2) - u**2)
+    objective = sg.Objective(sg.unroll(graph, max_visits=75), compiled=False)
+    state = dict.fromkeys(labels, 0.0) | {"x0": sg.Gaussian(1.0, 0.01)}
+    assert np.isfinite(objective.value(state, {"u": 0.1}))
 
 
 def test_the_number_of_functions_grows_with_the_logarithm():

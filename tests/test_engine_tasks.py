@@ -225,7 +225,7 @@ before = mode()
 import test_engine_tasks
 for threads in (1, 2):
     for build in ("lanes", "narrow"):
-        kernel = test_engine_tasks.kernel_of("random 3", build, threads=threads)
+        kernel = test_engine_tasks.kernel_of("random 3", build, build == "lanes", threads)
         points, selections = test_engine_tasks.points_of(test_engine_tasks.task("random 3")[0], 100)
         kernel.evaluate(points, selections)
         list(kernel.climb(points, selections, 20, np.full(100, 1e-9)))

@@ -189,6 +189,19 @@ def test_without_actions():
         assert climb(kernel, NONE, 10, selection=np.array([0.0, 1])).outcome == "converged"
 
 
+def test_numbers_that_change_are_seen():
+    """In other arrays, or in the same ones."""
+    objective = over_box(lambda u, x: ca.sin(x[0]) * u, -1.0, 1.0, states={"x": sg.State(3)})
+    situation = objective.situation({"x": np.zeros(3)})
+    for kernel in made(situation):
+        mean = np.array([0.1, 0.2, 0.3])
+        shared = [mean, *situation.shared[1:]]
+        for number in (0.1, 0.5, 0.9):
+            mean[:] = number
+            values, _ = kernel.bind(shared, *objective.bounds).evaluate(np.ones((2, 1)), np.zeros((2, 0)))
+            assert_close(values, np.sin([number] * 2))
+
+
 def test_a_kernel_can_be_sent_to_another_process(wavy_kernels):
     points = np.random.default_rng(0).uniform(-1, 1, (5, 3))
     for kernel in wavy_kernels:

@@ -114,7 +114,7 @@ def test_moments_and_slopes_are_finite_and_in_order(m, v):
 def covariance_after(exact):
     def build(n):
         mean, before = ca.MX.sym("mean", n), ca.MX.sym("before", n, n)
-        after = pair_covariance(before, rectify(mean, ca.diag(before)), exact)
+        after = pair_covariance(mean, before, rectify(mean, ca.diag(before)), exact)
         slopes = [ca.jacobian(after, mean), ca.jacobian(after, before)]
         return ca.Function("f", [mean, before], [after, *slopes])
 

@@ -11,7 +11,7 @@ import pytest
 from small_tasks import over_box
 
 import symgraph as sg
-from symgraph.compile import toolchain
+from symgraph.compile import rules, toolchain
 from symgraph.compile.compiled import CompiledKernel
 
 ROOT = Path(__file__).parents[1]
@@ -81,6 +81,23 @@ def test_another_task_is_compiled_anew(cache, compilations):
     plan()
     sg.solve(over_box(lambda u: -(u**2), 0.0, 1.0, compiled=True), {})
     assert len(compilations) == 2
+
+
+def test_a_rule_decides_what_is_compiled_where_its_function_is_called(cache, compilations, monkeypatch):
+    """And nowhere else: networks give rules to functions of theirs."""
+    monkeypatch.setattr(rules, "_ADJOINTS", dict(rules._ADJOINTS))
+    x, y, dy = (ca.SX.sym(name) for name in ("x", "y", "dy"))
+    square = ca.Function("square", [x], [x**2])
+    u, chosen = ca.MX.sym("u"), ca.MX.sym("chosen", 0)
+    calls, alone = (ca.Function("f", [u, chosen], [value]) for value in (square(u), ca.sin(u)))
+    slopes = []
+    for factor in (3, 5):
+        rules.set_adjoint(square, ca.Function("adjoint", [x, y, dy], [factor * dy]))
+        for function in (calls, alone):
+            bound = CompiledKernel(function, toolchain.find_compiler()).bind([], -np.ones(1), np.ones(1))
+            slopes.append(float(bound.evaluate(np.array([[0.5]]), np.zeros((1, 0)))[1][0, 0]))
+    assert slopes == pytest.approx([3, np.cos(0.5), 5, np.cos(0.5)])
+    assert len(compilations) == 3
 
 
 def test_another_compiler_or_version_is_compiled_anew(cache, compilations, monkeypatch):

@@ -5,8 +5,9 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
+import warnings
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache, cached_property
 from importlib import resources
 from itertools import pairwise
@@ -17,9 +18,10 @@ import casadi as ca
 import numpy as np
 
 from symgraph.compile.kernel import NEVER, AdadeltaSteps, BoundKernel, Ended, Kernel, Outcome, Stop
-from symgraph.compile.rules import adjoints
+from symgraph.compile.rules import rules_in
 from symgraph.compile.source import kernel_source
 from symgraph.compile.toolchain import load
+from symgraph.errors import CompileError
 from symgraph.slots import Array, Choices
 
 SLICE = 0.05  # seconds of a search between two looks at what the user wants
@@ -63,7 +65,13 @@ class CompiledKernel(Kernel):
     @cached_property
     def narrow(self) -> Library:
         """For points one at a time."""
-        return Library(self.function, self._compiler, lanes=False, single=self.single) if self._heavy else self.wide
+        if not self._heavy:
+            return self.wide
+        try:
+            return Library(self.function, self._compiler, lanes=False, single=self.single)
+        except CompileError as error:
+            warnings.warn(f"{error}\nsingle points are computed by code for many, which is slower", stacklevel=2)
+            return self.wide
 
     def library(self, count: int) -> Library:
         """Return the code that is best for so many points."""
@@ -91,7 +99,7 @@ class Library:
 
     def __init__(self, function: ca.Function, compiler: str, lanes: bool, single: bool) -> None:
         key = hashlib.sha256(function.serialize().encode())
-        for part in (*_engine(), *(adjoint.serialize() for adjoint in adjoints()), repr((lanes, single))):
+        for part in (*_engine(), *rules_in(function), repr((lanes, single))):
             key.update(part.encode())
         code: Any = load(key.hexdigest(), lambda: kernel_source(function, lanes, single), compiler)
         pointer: Any = ctypes.c_void_p
@@ -131,9 +139,10 @@ class _Prepared:
     """Bound inputs of a library, and what follows from them; only read from here on, by any thread."""
 
     def __init__(self, library: Library, columns: Sequence[Array]) -> None:
-        self._columns = columns
+        # Others may write to their own numbers later.
+        self._columns = [column.copy() if column.flags.writeable else column for column in columns]
         block, early = aligned(library.block, library.real), aligned(library.early_work, library.real)
-        self._kept = [*(np.ascontiguousarray(column, dtype=library.real) for column in columns), block]
+        self._kept = [*(np.ascontiguousarray(column, dtype=library.real) for column in self._columns), block]
         self._pointers = (ctypes.c_void_p * len(self._kept))(*[address(column) for column in self._kept])
         self.address = ctypes.addressof(self._pointers)
         library.code.symgraph_bind(self.address, address(block), address(early))
@@ -265,9 +274,10 @@ def _side_by_side(work: Callable[..., None], arguments: list[tuple[Any, ...]]) -
         for given in arguments:
             work(*given)
         return
-    futures = [_pool(len(arguments), os.getpid()).submit(work, *given) for given in arguments[1:]]
+    futures: list[Future[None]] = []
     interrupt: KeyboardInterrupt | None = None
     try:
+        futures.extend(_pool(os.getpid()).submit(work, *given) for given in arguments[1:])
         work(*arguments[0])
     finally:
         while not all(future.done() for future in futures):  # arrays must stay until nobody writes to them
@@ -282,9 +292,9 @@ def _side_by_side(work: Callable[..., None], arguments: list[tuple[Any, ...]]) -
 
 
 @cache
-def _pool(threads: int, process: int) -> ThreadPoolExecutor:
-    """Return threads; a forked process has none of its parent's."""
-    return ThreadPoolExecutor(threads, thread_name_prefix=f"symgraph-{process}")
+def _pool(process: int) -> ThreadPoolExecutor:
+    """Return the threads of a process; a forked one has none of its parent's."""
+    return ThreadPoolExecutor(thread_name_prefix=f"symgraph-{process}")
 
 
 def _by_selection(selections: Array) -> Choices | None:

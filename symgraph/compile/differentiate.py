@@ -117,6 +117,7 @@ def copied(target: Program, operation: Operation, new: dict[Value, Value]) -> No
     """Write an operation into another program, where its arguments are `new`."""
     args = tuple(new[arg] for arg in operation.args)
     made: Sequence[Value]
+    target.reversing = operation.reverse
     if operation.is_elementwise:
         made = [target.elementwise(int(operation.code), *args)]
     elif operation.code == "gather":
@@ -192,6 +193,7 @@ class _Sweep:
 
     def reverse(self, seeds: Iterable[tuple[Value, Value]]) -> None:
         """Go back from adjoints of values to those of all that they follow from."""
+        self._target.reversing = True
         for value, seed in seeds:
             self._give(value, seed)
         for operation in reversed(list(self._target.operations)):

@@ -43,9 +43,12 @@ class Hoister:
         bound = [x for x in whole.inputs if x.kind == Kind.BOUND]
         new = dict(zip(program.inputs, whole.inputs, strict=True))
         operations = _used(program)
-        divisors = Counter(o.args[1] for o in operations if o.code == ca.OP_DIV and o.outputs[0].kind > Kind.BOUND)
+        # In the reverse sweep one division serves all with the same divisor; values stay what CasADi makes of them.
+        divisions = [o for o in operations if o.code == ca.OP_DIV and o.reverse and o.outputs[0].kind > Kind.BOUND]
+        divisors = Counter(o.args[1] for o in divisions)
         for operation in operations:
-            if operation.code == ca.OP_DIV and divisors[operation.args[1]] > 1:  # one division serves all
+            whole.reversing = operation.reverse
+            if operation.reverse and operation.code == ca.OP_DIV and divisors[operation.args[1]] > 1:
                 x, y = (new[arg] for arg in operation.args)
                 inverse = whole.elementwise(ca.OP_INV, y)
                 new[operation.outputs[0]] = whole.elementwise(ca.OP_MUL, x, inverse)

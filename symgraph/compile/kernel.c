@@ -37,7 +37,7 @@ static void evaluate(const struct lanes *lanes, long B) {
 void symgraph_sizes(long long *sizes) {
   sizes[0] = BLOCK;
   sizes[1] = EARLY_WORK;
-  sizes[2] = (2 * N_ACTIONS + N_SELECTIONS + 1 + LATE_WORK) * MOST_LANES;
+  sizes[2] = (2LL * N_ACTIONS + N_SELECTIONS + 1 + LATE_WORK) * MOST_LANES;
   sizes[3] = (long long) sizeof(struct search);
 }
 

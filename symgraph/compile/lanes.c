@@ -215,7 +215,8 @@ static void add_products(real *z, const int *table, long count, const real *x, l
       for (l = 0; l < B; ++l) r[l] += p[xw > 1 ? l : 0] * q[yw > 1 ? l : 0];
   }
 }
-/* One lane for CasADi's own code, and back. */
+/* One lane for CasADi's own code, and back, in doubles that begin where one may. */
+static inline double *doubles(real *w) { return (double *) (((size_t) w + sizeof(double) - 1) / sizeof(double) * sizeof(double)); }
 static inline void take(const real *x, long xw, long lane, double *z, long count) {
   long i;
   for (i = 0; i < count; ++i) z[i] = (double) x[i * xw + (xw > 1 ? lane : 0)];

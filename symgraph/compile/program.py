@@ -56,12 +56,13 @@ class Operation:
     external    a CasADi function that has no program; detail: it
     """
 
-    __slots__ = ("args", "code", "detail", "outputs")
+    __slots__ = ("args", "code", "detail", "outputs", "reverse")
 
     def __init__(self, code: int | str, args: tuple[Value, ...], detail: Any, sizes: Iterable[int], kind: Kind) -> None:
         self.code = code
         self.args = args
         self.detail = detail
+        self.reverse = False  # whether it belongs to a reverse sweep
         self.outputs = tuple(Value(size, kind, self, spot) for spot, size in enumerate(sizes))
 
     @property
@@ -82,6 +83,7 @@ class Program:
         self.inputs = tuple(inputs)
         self.outputs: tuple[Value, ...] = ()
         self.operations: list[Operation] = []
+        self.reversing = False  # whether what is added belongs to a reverse sweep
         self._known: dict[Hashable, Operation] = {}
 
     def add(
@@ -93,6 +95,7 @@ class Program:
         if operation is None:
             kind = max((arg.kind for arg in args), default=Kind.BOUND)
             operation = Operation(code, args, detail, sizes, kind)
+            operation.reverse = self.reversing
             self.operations.append(operation)
             self._known[known] = operation
         return operation.outputs

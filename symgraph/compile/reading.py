@@ -12,6 +12,7 @@ import numpy as np
 from symgraph.compile.elementwise import ELEMENTWISE
 from symgraph.compile.program import Indices, Kind, Program, Value
 from symgraph.compile.rules import adjoint_of
+from symgraph.errors import CompileError
 
 INLINED = 64  # instructions up to which a function that is called several times is written out each time
 
@@ -43,11 +44,11 @@ class Reader:
 
     def write(self, program: Program, function: ca.Function, inputs: Sequence[Value]) -> list[Value]:
         """Write what a function does to values into a program."""
-        if function.is_a("SXFunction"):
+        if function.is_a("SXFunction") and not _calls(function):
             return write_scalars(program, function, inputs)
         if function.is_a("MXFunction"):
             return _MatrixWriter(self, program, function, inputs).run()
-        return self.write_call(program, function, inputs)
+        return self._called(program, function, inputs)
 
     def write_call(self, program: Program, function: ca.Function, args: Sequence[Value]) -> list[Value]:
         """Write a call of a function: what it does, where that is little or done nowhere else, or the call itself."""
@@ -61,7 +62,7 @@ class Reader:
         rule = adjoint_of(function)
         if rule is not None:
             return _write_ruled(program, function, rule, args)
-        if function.is_a("SXFunction") or function.is_a("MXFunction"):
+        if function.is_a("MXFunction") or (function.is_a("SXFunction") and not _calls(function)):
             if self._sites[hash(function)] <= 1 or self._length(function) <= INLINED:
                 return self.write(program, function, args)
             return list(program.add("call", tuple(args), self.program(kinds, function), sizes, hash(function)))
@@ -77,7 +78,11 @@ class Reader:
             rule = adjoint_of(inner)
             if rule is not None:
                 return _write_ruled(program, inner, rule, args)
-            if inner.is_a("SXFunction") and all(inner.numel_in(i) == 1 for i in range(inner.n_in())):
+            if (
+                inner.is_a("SXFunction")
+                and not _calls(inner)
+                and all(inner.numel_in(i) == 1 for i in range(inner.n_in()))
+            ):
                 return write_scalars(program, inner, args, each=True)
             detail = (self.program(kinds, inner), times)
             return list(program.add("repeat", tuple(args), detail, sizes, (hash(inner), times)))
@@ -116,6 +121,11 @@ def _called_by(function: ca.Function) -> list[ca.Function]:
     return [function.instruction_MX(k).which_function() for k in calls]
 
 
+def _calls(function: ca.Function) -> bool:
+    """Whether scalar code calls functions, which CasADi lets it do with interpolants."""
+    return any(function.instruction_id(k) == ca.OP_CALL for k in range(function.n_instructions()))
+
+
 def write_scalars(
     program: Program, function: ca.Function, inputs: Sequence[Value], each: bool = False, spread: bool = True
 ) -> list[Value]:
@@ -139,8 +149,8 @@ def write_scalars(
             results[outs[0]][outs[1]] = work[args[0]]
         elif code == ca.OP_CONST:
             work[outs[0]] = program.constant(function.instruction_constant(k))
-        elif code == ca.OP_CALL:
-            raise NotImplementedError("scalar code that calls functions")
+        elif code not in ELEMENTWISE:
+            raise CompileError(f"{function.name()}: CasADi's operation {code} has no C code; please report it")
         else:
             work[outs[0]] = program.elementwise(code, *(work[i] for i in args))
     zero = program.constant(0.0)

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
+
 import casadi as ca
 
-# By hash, which is that of CasADi's object: wrappers of one object are not equal. The function is kept with it.
-_ADJOINTS: dict[int, tuple[ca.Function, ca.Function]] = {}
+# By what the function is, so that one that was sent to another process has its rule there.
+_ADJOINTS: dict[str, ca.Function] = {}
+_DIGESTS: dict[
+    int, tuple[ca.Function, str]
+] = {}  # by CasADi's object, which is kept so that no other one takes its place
 
 
 def set_adjoint(function: ca.Function, adjoint: ca.Function) -> None:
@@ -15,15 +20,27 @@ def set_adjoint(function: ca.Function, adjoint: ca.Function) -> None:
         function: x₁ … → y₁ …
         adjoint: x₁ …, y₁ …, and the adjoints of y₁ … → those of x₁ …
     """
-    _ADJOINTS[hash(function)] = function, adjoint
+    _ADJOINTS[_digest(function)] = adjoint
 
 
 def adjoint_of(function: ca.Function) -> ca.Function | None:
     """Return a function's own reverse derivative, if it was given one."""
-    found = _ADJOINTS.get(hash(function))
-    return None if found is None else found[1]
+    return _ADJOINTS.get(_digest(function)) if function.is_a("SXFunction") else None
 
 
-def adjoints() -> list[ca.Function]:
-    """Return all that were given."""
-    return [adjoint for _, adjoint in _ADJOINTS.values()]
+def rules_in(function: ca.Function) -> list[str]:
+    """Return the rules of all that a function calls, in a form that tells them apart."""
+    found = {}
+    for called in (function, *function.find_functions()):
+        inner = called.info()["f"] if called.class_name() == "Map" else called
+        rule = adjoint_of(inner)
+        if rule is not None:
+            found[_digest(inner)] = rule.serialize()
+    return [part for pair in sorted(found.items()) for part in pair]
+
+
+def _digest(function: ca.Function) -> str:
+    key = hash(function)
+    if key not in _DIGESTS:
+        _DIGESTS[key] = function, hashlib.sha256(function.serialize().encode()).hexdigest()
+    return _DIGESTS[key][1]

@@ -68,7 +68,7 @@ static void place(const double *u, const double *low, const double *high, double
 /* d = -H g within the actions of the mask, by the two-loop recursion over the curvature pairs, newest first (Nocedal &
    Wright 2006, algorithm 7.4). */
 static void quasi_newton(const struct pairs *pairs, const double *g, const double *mask, double *d) {
-  double alpha[PAIRS], rho[PAIRS], scale = 1;
+  double alpha[PAIRS] = {0}, rho[PAIRS] = {0}, scale = 1;
   int i, k;
   for (i = 0; i < N_ACTIONS; ++i) d[i] = -mask[i] * g[i];
   for (k = 0; k < pairs->stored; ++k) {
@@ -396,6 +396,14 @@ static void end_walk(struct walk *k, const struct search *all) {
   all->outcomes[k->start] = k->outcome;
 }
 
+/* A number between bounds, which rounding to single precision must not carry it past. */
+static real within(double x, double low, double high) {
+  real y = (real) x;
+  if ((double) y > high) y = MATH(nextafter)(y, (real) -INFINITY);
+  if ((double) y < low) y = MATH(nextafter)(y, (real) INFINITY);
+  return y;
+}
+
 /* Evaluate all walks once and let each make a step, `rounds` times or until none is left. */
 static void advance(struct search *all, const struct lanes *lanes, long rounds) {
   for (; rounds > 0; --rounds) {
@@ -414,7 +422,7 @@ static void advance(struct search *all, const struct lanes *lanes, long rounds) 
     B = fill(all->active);
     for (b = 0; b < B; ++b) {
       const struct walk *k = all->walks + (b < all->active ? b : 0);
-      for (i = 0; i < N_ACTIONS; ++i) lanes->x[i * B + b] = (real) k->x[i];
+      for (i = 0; i < N_ACTIONS; ++i) lanes->x[i * B + b] = within(k->x[i], all->set.low[i], all->set.high[i]);
       for (i = 0; i < N_SELECTIONS; ++i) lanes->chosen[i * B + b] = (real) all->chosen[k->start * N_SELECTIONS + i];
     }
     evaluate(lanes, B);

@@ -26,7 +26,7 @@ class Writer:
     def __init__(self) -> None:
         self._functions: dict[tuple[Program, bool], tuple[str, int]] = {}
         self._tables: dict[tuple[str, bytes], str] = {}
-        self._externals: dict[int, tuple[ca.Function, str]] = {}
+        self._externals: dict[int, tuple[ca.Function, ca.Function]] = {}
         self._text: list[str] = []
 
     def function(self, program: Program, lanes: bool) -> tuple[str, int]:
@@ -55,20 +55,20 @@ class Writer:
             self.add(f"static const {kind} {self._tables[key]}[] = {{{text}}};")
         return self._tables[key]
 
-    def external(self, function: ca.Function) -> str:
-        """Return the name under which CasADi's code is called."""
+    def external(self, function: ca.Function) -> ca.Function:
+        """Return the function under whose name CasADi's code is called."""
         key = hash(function)
         if key not in self._externals:
-            self._externals[key] = function, f"external_{len(self._externals)}"
+            inputs, name = function.mx_in(), f"external_{len(self._externals)}"
+            self._externals[key] = function, ca.Function(name, inputs, function.call(inputs, False, True))
         return self._externals[key][1]
 
     def _casadi(self) -> str:
         if not self._externals:
             return ""
         generator = ca.CodeGenerator("externals", {"with_header": False, "include_math": False})
-        for function, name in self._externals.values():
-            inputs = function.mx_in()
-            generator.add(ca.Function(name, inputs, function.call(inputs, False, True)))
+        for _, wrapped in self._externals.values():
+            generator.add(wrapped)
         return generator.dump()
 
 
@@ -278,16 +278,16 @@ class _FunctionWriter:
 
     def _write_external(self, operation: Operation) -> None:
         """CasADi's own code does one lane after the other, with doubles of its own."""
-        function = operation.detail
-        name = self._writer.external(function)
+        function = self._writer.external(operation.detail)
         count = sum(x.size for x in (*operation.args, *operation.outputs))
         wide = self._wide(operation.outputs[0])
-        self._below = max(self._below, 2 * (count + function.sz_w() + 64))
+        # Doubles, of which one takes the room of two numbers in single precision, and one more to begin where one may.
+        self._below = max(self._below, 2 * (count + function.sz_w() + 1))
         lines = [
-            "  { long l, i;",
-            f"    const double *x[{function.sz_arg() + 8}]; double *y[{function.sz_res() + 8}];",
-            f"    casadi_int iw[{function.sz_iw() + 8}]; int failed;",
-            f"    double *const s = (double *) ({self._free()});",
+            "  { long l;",
+            f"    const double *x[{function.sz_arg() + 1}]; double *y[{function.sz_res() + 1}];",
+            f"    casadi_int iw[{function.sz_iw() + 1}]; int failed;",
+            f"    double *const s = doubles({self._free()});",
             f"    for (l = 0; l < {'B' if wide else 1}; ++l) {{",
         ]
         at = 0
@@ -302,7 +302,7 @@ class _FunctionWriter:
                 f"      put({self._pointer(result)}, {self._each(result)}, l, s + {at}, {result.size}, failed);"
             )
             at += result.size
-        lines.append(f"      failed = {name}(x, y, iw, s + {at}, 0);")
+        lines.append(f"      failed = {function.name()}(x, y, iw, s + {at}, 0);")
         self._lines += [*lines, *outs, "    } }"]
 
     def _write_outputs(self) -> None:

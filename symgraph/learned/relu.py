@@ -45,7 +45,7 @@ def rectify(mean: ca.MX, variance: ca.MX) -> Rectified:
 def _rectified() -> ca.Function:
     """(m, v) → the moments E and E[max(0, x)²] - E², Φ(α), and ∂E/∂v = φ(α)/2s."""
     m, v = ca.SX.sym("m"), ca.SX.sym("v")
-    inverse = 1 / ca.sqrt(v + FLOOR)
+    inverse = ca.sqrt(1 / (v + FLOOR))  # CasADi would turn products with 1 / √ into divisions
     x = m * inverse * math.sqrt(0.5)
     gain = 0.5 + 0.5 * ca.erf(x)
     slope = ca.exp(-(x * x)) * inverse * (0.5 / math.sqrt(2 * math.pi))

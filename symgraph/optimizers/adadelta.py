@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,42 +111,55 @@ class Adadelta(Optimizer):
         ended: list[Run] = []
         finished: list[Run] = []
         interrupted = False
-        try:
-            while len(finished) < wanted and queue.waiting and spent < total and not (ended and problem.stop):
-                # Where runs come back to the queue, each decides which one is next.
-                batch = queue.pop(1 if self.requeue else wanted - len(finished), finished)
-                limit = min(self.run_iterations, max(1, (total - spent) // len(batch)))
-                for run in self._moved(problem, batch, limit):
-                    spent += len(run.history) - 1
-                    best = best_of(finished)
-                    if run.outcome == "converged" or (
-                        run.outcome in ("iteration limit", "oscillation") and (best is None or run.value > best.value)
-                    ):
-                        finished.append(run)
-                    if self.requeue and run.outcome in ("converged", "iteration limit", "oscillation"):
-                        queue.waiting.append(run)
-                    ended.append(run)
-                    problem.progress.update(max(spent / total, len(finished) / wanted), 1.0)
-        except KeyboardInterrupt:
-            interrupted = True
+        while (
+            len(finished) < wanted
+            and queue.waiting
+            and spent < total
+            and not interrupted
+            and not (ended and problem.stop)
+        ):
+            # Where runs come back to the queue, each decides which one is next.
+            affordable = -(-(total - spent) // self.run_iterations)
+            batch = queue.pop(1 if self.requeue else min(wanted - len(finished), affordable), finished)
+            limit = min(self.run_iterations, max(1, (total - spent) // len(batch)))
+            moved, interrupted = self._moved(problem, batch, limit)
+            for run in moved:
+                spent += len(run.history) - 1
+                best = best_of(finished)
+                if run.outcome == "converged" or (
+                    run.outcome in ("iteration limit", "oscillation") and (best is None or run.value > best.value)
+                ):
+                    finished.append(run)
+                if self.requeue and run.outcome in ("converged", "iteration limit", "oscillation"):
+                    queue.waiting.append(run)
+            ended += moved
+            problem.progress.update(max(spent / total, len(finished) / wanted), 1.0)
         polished: list[Run] = []
         if self.polish and not interrupted and not problem.stop:
             polished, interrupted = self._polished(problem, ended)
         ended = [*map(problem.judge, ended), *polished]
         return Search(ended, status_of(problem, ended), interrupted)
 
-    def _moved(self, problem: Problem, batch: list[Run], limit: int) -> Iterator[Run]:
-        """Move points for at most `limit` steps each; a point that came back keeps where it first started."""
+    def _moved(self, problem: Problem, batch: list[Run], limit: int) -> tuple[list[Run], bool]:
+        """Move points for at most `limit` steps each; also say whether that was interrupted."""
         steps = AdadeltaSteps(self.decay, self.epsilon, self.tolerance, self.oscillation, self.scaled, self.keep_best)
-        groups: dict[int, tuple[BoundKernel, list[Run]]] = {}
-        for run in batch:
-            kernel = problem.kernel_for(run.choices)
-            groups.setdefault(id(kernel), (kernel, []))[1].append(run)
-        for kernel, runs in groups.values():
-            points, choices = np.array([run.point for run in runs]), np.array([run.choices for run in runs])
-            scales = np.array([problem.scale(run.choices) if self.scaled else 1.0 for run in runs])
-            for p, moved in kernel.ascend(points, problem.one_hot(choices), limit, steps, scales):
-                yield Run.of(runs[p].start, runs[p].choices, moved)
+        moved: dict[int, Run] = {}  # by place in the batch: which one ends first depends on the machine
+        try:
+            groups: dict[int, tuple[BoundKernel, list[int]]] = {}
+            for place, run in enumerate(batch):
+                kernel = problem.kernel_for(run.choices)
+                groups.setdefault(id(kernel), (kernel, []))[1].append(place)
+            for kernel, places in groups.values():
+                runs = [batch[place] for place in places]
+                points, choices = np.array([run.point for run in runs]), np.array([run.choices for run in runs])
+                scales = np.array([problem.scale(run.choices) if self.scaled else 1.0 for run in runs])
+                for p, ended in kernel.ascend(points, problem.one_hot(choices), limit, steps, scales):
+                    # A point that came back keeps where it first started.
+                    moved[places[p]] = Run.of(runs[p].start, runs[p].choices, ended)
+                    problem.progress.update(len(moved), len(batch))
+        except KeyboardInterrupt:
+            return [moved[p] for p in sorted(moved)], True
+        return [moved[p] for p in sorted(moved)], False
 
     @staticmethod
     def _polished(problem: Problem, runs: list[Run]) -> tuple[list[Run], bool]:
@@ -164,8 +176,9 @@ class Adadelta(Optimizer):
         choices = np.array([run.choices for run in chosen])
         iterations = POLISH_ITERATIONS if problem.constrained is None else CONSTRAINED_ITERATIONS
         polished, interrupted = climbed(problem, points, choices, iterations, 1e-9)
-        for before, after in zip(chosen, polished, strict=False):
-            after.start = before.start
+        first = {run.point.tobytes() + run.choices.tobytes(): run.start for run in chosen}
+        for run in polished:
+            run.start = first[run.start.tobytes() + run.choices.tobytes()]
         return polished, interrupted
 
 

@@ -26,12 +26,13 @@ def climbed(
 ) -> tuple[list[Run], bool]:
     """Climb from points (P, n) under choices (P, s); return the runs, and whether an interrupt ended it before all."""
     hot = problem.one_hot(choices)
-    runs: list[Run] = []
+    runs: dict[int, Run] = {}  # by start: which one ends first depends on the machine
+    interrupted = False
     scales = np.array([problem.scale(choice) for choice in choices])
     try:
         if problem.constrained is None:
             for p, ended in problem.kernel.climb(points, hot, iterations, tolerance * scales):
-                runs.append(Run.of(points[p], choices[p], ended))
+                runs[p] = Run.of(points[p], choices[p], ended)
                 problem.progress.update(len(runs), len(points))
         else:
             for p in range(len(points)):
@@ -39,11 +40,11 @@ def climbed(
                     break
                 problem.know(choices[p])
                 ended = problem.constrained.climb(points[p], choices[p], hot[p], iterations, tolerance, scales[p])
-                runs.append(problem.judge(Run.of(points[p], choices[p], ended)))
+                runs[p] = problem.judge(Run.of(points[p], choices[p], ended))
                 problem.progress.update(p + 1, len(points))
     except KeyboardInterrupt:
-        return runs, True
-    return runs, False
+        interrupted = True
+    return [runs[p] for p in sorted(runs)], interrupted
 
 
 def promising_points(problem: Problem, rng: np.random.Generator, starts: int, samples: int) -> tuple[Array, Choices]:
