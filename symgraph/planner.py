@@ -20,12 +20,14 @@ from symgraph.optimizers.constrained import Constrained
 from symgraph.optimizers.lbfgs import Lbfgs
 from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
 from symgraph.optimizers.settings import number, positive_whole
+from symgraph.outcomes import NodeOutcomes
 from symgraph.plan import Plan, PlanRun
 from symgraph.plan_table import PlanRow
 from symgraph.progress import Progress
 from symgraph.situation import Situation
 from symgraph.slots import Action, Array, Choices, Selection, State
 
+ROUNDING, SMALL = 1e-7, 1e-9  # of a value, and of the spread of J: differences that are rounding
 MOST_TOLD = 8  # requirements that a plan says to be missed
 
 Guess = Plan | PlanRow | Mapping[str, Any]
@@ -94,17 +96,13 @@ def solve(
         if search is None:
             with _set_in_time(stop):
                 search = optimizer.run(problem, rng)
-    best = search.runs[0] if explores else best_of(search.runs)
-    if best is None:
+    found = _told_exactly(objective, situation, problem, search, explores)
+    if found is None:
         if search.interrupted:
             raise KeyboardInterrupt
         raise SolveError(_why_not_finite(objective, situation, search))
+    best, nodes = found
     chosen = _names(objective, best.choices)
-    if objective.precision == "single":  # the search is over: what it found is told exactly
-        best.value = float(
-            situation.build.interpreted([best.point, objective.one_hot(chosen), *situation.shared])[0][0]
-        )
-    nodes = objective.outcomes_of(situation, best.point, chosen)
     violation = float(objective.breaches(situation, best.point, objective.one_hot(chosen)).max(initial=0.0))
     status = search.status
     if search.interrupted:
@@ -146,6 +144,26 @@ def _set_in_time(stop: Stop) -> Iterator[None]:
         yield
     finally:
         timer.cancel()
+
+
+def _told_exactly(
+    objective: Objective, situation: Situation, problem: Problem, search: Search, explores: bool
+) -> tuple[Run, NodeOutcomes] | None:
+    """Return the best run with its outcomes, and give it the value that follows from these.
+
+    Compiled code rounds otherwise than models do in numbers, and in single precision much more. Where a model jumps, a
+    search may end on an edge where its own arithmetic alone stays: then the next best run counts.
+    """
+    told: set[int] = set()
+    while (best := search.runs[0] if explores else best_of(search.runs)) is not None:
+        nodes = objective.outcomes_of(situation, best.point, _names(objective, best.choices))
+        value = nodes[0].value - objective.risk * nodes[0].deviation
+        rounding = ROUNDING * abs(best.value) + SMALL * problem.scale(best.choices)
+        if explores or id(best) in told or abs(value - best.value) <= rounding:
+            return best, nodes
+        best.value = value if np.isfinite(value) else -np.inf
+        told.add(id(best))
+    return None
 
 
 def _told(objective: Objective, problem: Problem, run: Run) -> list[str]:
