@@ -163,6 +163,11 @@ class NodeOutcomes(Sequence[NodeOutcome]):
             reach[node.index] = before * self.shares[node.index] if before else 0.0  # not 0 · NaN
         return reach
 
+    def worth(self, risk: float) -> float:
+        """Return the expected sum of rewards, less so many of its standard deviations."""
+        deviation = np.sqrt(np.maximum(0.0, self._variances[0])) if risk else 0.0
+        return float(self._values[0] - risk * deviation)
+
     @cached_property
     def _values(self) -> Array:
         values = np.zeros(len(self))

@@ -157,7 +157,7 @@ def _told_exactly(
     told: set[int] = set()
     while (best := search.runs[0] if explores else best_of(search.runs)) is not None:
         nodes = objective.outcomes_of(situation, best.point, _names(objective, best.choices))
-        value = nodes[0].value - objective.risk * nodes[0].deviation
+        value = nodes.worth(objective.risk)
         rounding = ROUNDING * abs(best.value) + SMALL * problem.scale(best.choices)
         if explores or id(best) in told or abs(value - best.value) <= rounding:
             return best, nodes

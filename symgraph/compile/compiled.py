@@ -193,7 +193,7 @@ class _BoundCompiled(BoundKernel):
             points, chosen = points[order], chosen[order]
         inputs, stop = self._for(len(points)), self._given[3].address
         values, gradients = np.empty(len(points)), np.empty(points.shape)
-        edges = np.linspace(0, len(points), self._threads + 1).astype(int).tolist()
+        edges = [len(points) * thread // self._threads for thread in range(self._threads + 1)]
         parts = [[array[a:b] for array in (points, chosen, values, gradients)] for a, b in pairwise(edges) if b > a]
 
         def work(part: list[Array], workspace: int) -> None:

@@ -8,7 +8,7 @@ from itertools import islice
 import casadi as ca
 import numpy as np
 
-from symgraph.compile.elementwise import expression
+from symgraph.compile.loops import Loop, number
 from symgraph.compile.program import Indices, Operation, Program, Value, constant_of
 from symgraph.compile.schedule import Schedule, Step
 
@@ -70,16 +70,6 @@ class Writer:
         for _, wrapped in self._externals.values():
             generator.add(wrapped)
         return generator.dump()
-
-
-def number(value: float) -> str:
-    """Return a number as C has it."""
-    value = float(value)
-    if np.isnan(value):
-        return "NAN"
-    if np.isinf(value):
-        return "INFINITY" if value > 0 else "-INFINITY"
-    return repr(value)
 
 
 class _FunctionWriter:
@@ -146,7 +136,7 @@ class _FunctionWriter:
 
     def _write_loop(self, step: Step) -> None:
         size = step[0].outputs[0].size
-        loop = _Loop(self, size, self._lanes)
+        loop = Loop(self._schedule, self._pointer, size, self._lanes)
         for operation in step:
             loop.add(operation)
         stored = [o.outputs[0] for o in step if self._schedule.is_used_later(o.outputs[0], step)]
@@ -316,80 +306,6 @@ class _FunctionWriter:
 
 
 _SIGNATURE = "(const real *const *arg, real *const *res, real *w, long B)"
-
-
-class _Loop:
-    """Writes elementwise operations on arrays of one size as one loop."""
-
-    def __init__(self, writer: _FunctionWriter, size: int, lanes: bool) -> None:
-        self._writer = writer
-        self._size = size
-        self._lanes = lanes
-        self._vector = lanes or size > 1
-        self._names: dict[Value, str] = {}
-        self._body: list[str] = []
-        self._plain = True  # all arrays in step, element by element and lane by lane
-
-    def add(self, operation: Operation) -> None:
-        args = [self._read(arg) for arg in operation.args]
-        kind = "vec" if self._vector else "real"
-        text = expression(int(operation.code), args, "v" if self._vector else "s")
-        self._body.append(f"const {kind} {self._name(operation.outputs[0])} = {text};")
-
-    def _name(self, value: Value) -> str:
-        self._names[value] = f"v{len(self._names)}"
-        return self._names[value]
-
-    def _read(self, value: Value) -> str:
-        schedule = self._writer._schedule
-        root = schedule.source(value)
-        if value in self._names:
-            return self._names[value]
-        if root in self._names and root.size == value.size:
-            return self._names[root]
-        numbers = constant_of(value)
-        if numbers is not None and numbers.size == 1:
-            text = f"all({number(numbers[0])})" if self._vector else number(numbers[0])
-        else:
-            pointer, single, wide = self._writer._pointer(value), value.size < self._size, schedule.is_wide(value)
-            if not self._vector:
-                text = f"*({pointer})"
-            elif self._lanes and wide:
-                text = f"load({pointer} + {'l' if single and self._size > 1 else 'i'})"
-                self._plain = self._plain and not (single and self._size > 1)
-            elif self._lanes:
-                text = f"all(({pointer})[{'0' if single or self._size == 1 else 'e'}])"
-                self._plain = self._plain and (single or self._size == 1)
-            elif single:
-                text = f"all(*({pointer}))"
-            else:
-                text = f"load_some({pointer} + i, {self._size} - i)"
-        kind = "vec" if self._vector else "real"
-        name = self._name(value)
-        self._body.append(f"const {kind} {name} = {text};")
-        return name
-
-    def lines(self, stored: Sequence[Value]) -> list[str]:
-        """Return the loop, which ends by storing values."""
-        for value in stored:
-            pointer, name = self._writer._pointer(value), self._names[value]
-            if not self._vector:
-                self._body.append(f"*({pointer}) = {name};")
-            elif self._lanes:
-                self._body.append(f"store({pointer} + i, {name});")
-            else:
-                self._body.append(f"store_some({pointer} + i, {name}, {self._size} - i);")
-        if not self._vector:
-            head = ["  {"]
-        elif not self._lanes:
-            head = [f"  {{ long i; for (i = 0; i < {self._size}; i += VL) {{"]
-        elif self._plain:
-            head = [f"  {{ long i; for (i = 0; i < {self._size} * B; i += VL) {{"]
-        else:
-            loops = f"for (e = 0; e < {self._size}; ++e) for (l = 0; l < B; l += VL) {{"
-            head = [f"  {{ long e, l; {loops}", "    const long i = e * B + l;"]
-        tail = ["  } }"] if self._vector else ["  }"]
-        return [*head, *(f"    {line}" for line in self._body), *tail]
 
 
 def _runs(where: Indices, edges: Indices) -> Iterable[tuple[int, int, int, int, int]]:
