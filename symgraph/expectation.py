@@ -25,19 +25,13 @@ import casadi as ca
 
 from symgraph.binding import REQUIREMENT, REWARD, BoundModel
 from symgraph.constraints import Constraint, constraints_of, merit
+from symgraph.folding import Folder, Unsteady
 from symgraph.model import Parameter
 from symgraph.requirement import deviation
 from symgraph.slots import Gaussian, State
-from symgraph.structure import Chain, Structure, is_open
+from symgraph.structure import Structure, is_open
 from symgraph.tree import Tree, TreeBranch, TreeGroup
-
-# Scalar instructions up to which an expression is flattened: flat code runs several times faster, but the C compiler's
-# time grows faster than its length.
-FLATTEN_LIMIT = 5_000
-
-MOST_REFUSED = 64  # rounds written out one by one until what is uncertain is the same after each
-
-Dictionary = dict[str, Gaussian]  # the super-state-action dictionary of a node: label → Gaussian of MX
+from symgraph.worth import FLATTEN_LIMIT, Dictionary, Worth, applied, mixed, probability_of
 
 
 class Inputs:
@@ -158,47 +152,44 @@ def expected_value(tree: Tree, uncertain: frozenset[str], relaxed: bool = False,
     inputs = Inputs(tree, uncertain)
     try:
         return _Writer(tree, inputs, relaxed, risk, chains=not risk).run()  # a variance is no sum over rounds
-    except _Unsteady:
+    except Unsteady:
         return _Writer(tree, inputs, relaxed, risk, chains=False).run()
-
-
-class _Unsteady(Exception):
-    """What is uncertain goes on changing from round to round, so that chains cannot be folded."""
 
 
 class _Writer:
     """Writes the expression: dictionaries from the root to the leaves, values from the leaves to the root."""
 
     def __init__(self, tree: Tree, inputs: Inputs, relaxed: bool, risk: float, chains: bool) -> None:
-        self._tree = tree
-        self._inputs = inputs
-        self._relaxed = relaxed
-        self._risk = risk
-        self._structure = Structure(tree, chains)
+        self.tree = tree
+        self.inputs = inputs
+        self.root = inputs.root
+        self.relaxed = relaxed
+        self.risk = risk
+        self.structure = Structure(tree, chains)
         self._functions: dict[tuple[Any, ...], ca.Function] = {}
-        self._refused = 0  # chains in which one round leaves other labels uncertain than the one before
+        self._folder = Folder(self, self.structure)
 
     def run(self) -> Expectation:
         # Functions are written before those that call them: leaves first. For that, a first pass finds what is
         # uncertain where, without any calculus.
         uncertain = self._uncertain_labels()
-        for node in reversed(self._tree.nodes):
+        for node in reversed(self.tree.nodes):
             for group in node.groups:
                 for branch in group.branches:
-                    if branch.child is not None and self._structure.apart[branch.child]:
+                    if branch.child is not None and self.structure.apart[branch.child]:
                         self._write_function(branch, uncertain[node.index])
-        worth, instructions = self._worth(0, self._inputs.root)
+        worth, instructions = self.worth(0, self.inputs.root)
         value = worth.value
-        if self._risk:
-            value = value - self._risk * deviation(worth.variance)
+        if self.risk:
+            value = value - self.risk * deviation(worth.variance)
         margins = ca.vertcat(*worth.margins) if worth.margins else ca.MX(0, 1)
-        constraints = constraints_of(self._tree)
-        return Expectation(self._inputs, ca.densify(value), margins, constraints, instructions <= FLATTEN_LIMIT)
+        constraints = constraints_of(self.tree)
+        return Expectation(self.inputs, ca.densify(value), margins, constraints, instructions <= FLATTEN_LIMIT)
 
     def _uncertain_labels(self) -> list[frozenset[str]]:
-        found = [frozenset[str]()] * len(self._tree.nodes)
-        found[0] = frozenset(self._inputs.uncertain)
-        for node in self._tree.nodes:
+        found = [frozenset[str]()] * len(self.tree.nodes)
+        found[0] = frozenset(self.inputs.uncertain)
+        for node in self.tree.nodes:
             here = found[node.index]
             for group in node.groups:
                 for branch in group.branches:
@@ -212,301 +203,144 @@ class _Writer:
         key = self._key(branch, uncertain)
         if key in self._functions:
             return
-        slots = self._tree.graph.slots
-        here = {label: g for label, g in self._inputs.root.items() if not isinstance(slots[label], State)}
+        slots = self.tree.graph.slots
+        here = {label: g for label, g in self.inputs.root.items() if not isinstance(slots[label], State)}
         symbols: list[ca.MX] = []
-        for label in self._structure.needs(branch):
+        for label in self.structure.needs(branch):
             n = slots[label].size
             mean = ca.MX.sym(label, n)
             covariance = ca.MX.sym(label, n, n) if label in uncertain else None
             here[label] = Gaussian(mean, covariance)
             symbols += [mean] if covariance is None else [mean, covariance]
-        written, own = _apply(branch.branch.model, here)
-        worth, instructions = self._worth(branch.child or 0, {**here, **written})
+        written, own = applied(branch.branch.model, here)
+        worth, instructions = self.worth(branch.child or 0, {**here, **written})
         results = self._results(worth)
         name = f"branch_{len(self._functions)}"
-        inputs = symbols + self._shared_symbols
+        inputs = symbols + self.shared_symbols
         # Nobody asks for derivatives by selections and weights, and the reverse sweep would compute them.
-        by = 2 if self._relaxed else 1
-        follows = [True] * (len(symbols) + by) + [False] * (len(self._shared_symbols) - by)
+        by = 2 if self.relaxed else 1
+        follows = [True] * (len(symbols) + by) + [False] * (len(self.shared_symbols) - by)
         function = ca.Function(name, inputs, results, {"cse": True, "is_diff_in": follows})
         if own + instructions <= FLATTEN_LIMIT:
             function = function.expand()
         self._functions[key] = function
 
-    def _call(self, branch: TreeBranch, here: Dictionary) -> tuple[ca.Function, list[ca.MX]]:
+    def call(self, branch: TreeBranch, here: Dictionary) -> tuple[ca.Function, list[ca.MX]]:
         """Return the function of a branch that stands apart, and the arguments it takes here."""
         uncertain = frozenset(label for label, g in here.items() if g.covariance.nnz())
         arguments: list[ca.MX] = []
-        for label in self._structure.needs(branch):
+        for label in self.structure.needs(branch):
             arguments.append(here[label].mean)
             if label in uncertain:
                 arguments.append(here[label].covariance)
-        return self._functions[self._key(branch, uncertain)], arguments + self._shared_symbols
+        return self._functions[self._key(branch, uncertain)], arguments + self.shared_symbols
 
     def _key(self, branch: TreeBranch, uncertain: frozenset[str]) -> tuple[Any, ...]:
-        kind = self._structure.kinds[branch.child or 0]
-        return branch.branch.model, kind, uncertain.intersection(self._structure.needs(branch))
+        kind = self.structure.kinds[branch.child or 0]
+        return branch.branch.model, kind, uncertain.intersection(self.structure.needs(branch))
 
     @property
-    def _shared_symbols(self) -> list[ca.MX]:
-        inputs = self._inputs
+    def shared_symbols(self) -> list[ca.MX]:
+        inputs = self.inputs
         return [inputs.actions, inputs.selections, *(parameter.symbol for parameter in inputs.parameters)]
 
-    def _worth(self, root: int, dictionary: Dictionary) -> tuple[_Worth, float]:
+    def worth(self, root: int, dictionary: Dictionary) -> tuple[Worth, float]:
         """Write what a subtree is worth, up to the branches that stand apart; also count scalar instructions."""
         instructions = 0.0
         dictionaries = {root: dictionary}
         order = [root]  # grows while it is walked
-        groups: dict[int, list[list[tuple[ca.MX | float, _Worth | int]]]] = {}  # node → (probability, worth or child)
+        groups: dict[int, list[list[tuple[ca.MX | float, Worth | int]]]] = {}  # node → (probability, worth or child)
         margins: dict[int, list[ca.MX]] = {}
         for index in order:
             here = dictionaries.pop(index)
             groups[index], margins[index] = [], []
-            chain = self._chain_from(index, here)
+            chain = self._folder.chain_from(index, here)
             if chain is not None:
                 instructions = math.inf
-                reach, gained, dictionaries[chain.end] = self._fold(index, chain, here)
+                reach, gained, dictionaries[chain.end] = self._folder.fold(index, chain, here)
                 order.append(chain.end)
-                groups[index] = [[(1.0, _Worth(gained, ca.MX(0.0), []))], [(reach, chain.end)]]
+                groups[index] = [[(1.0, Worth(gained, ca.MX(0.0), []))], [(reach, chain.end)]]
                 continue
-            for requirement in self._tree.nodes[index].requirements:
-                outcome, count = _apply(requirement.model, here)
+            for requirement in self.tree.nodes[index].requirements:
+                outcome, count = applied(requirement.model, here)
                 instructions += count
                 margins[index] += requirement.margins(outcome[REQUIREMENT])
-            for group in self._tree.nodes[index].groups:
-                terms: list[tuple[ca.MX | float, _Worth | int]] = []
+            for group in self.tree.nodes[index].groups:
+                terms: list[tuple[ca.MX | float, Worth | int]] = []
                 groups[index].append(terms)
                 if is_open(group):
                     instructions = math.inf
-                    terms.append((1.0, (self._blend if self._relaxed else self._switch)(group, here)))
+                    terms.append((1.0, (self._blend if self.relaxed else self._switch)(group, here)))
                     continue
                 model = group.group.probability
-                shares, count = _apply(model if isinstance(model, BoundModel) else None, here)
+                shares, count = applied(model if isinstance(model, BoundModel) else None, here)
                 instructions += count
                 for branch in group.branches:
-                    probability = _share(branch, shares)
-                    if branch.child is not None and self._structure.apart[branch.child]:
+                    probability = probability_of(branch, shares)
+                    if branch.child is not None and self.structure.apart[branch.child]:
                         instructions = math.inf
-                        function, arguments = self._call(branch, here)
-                        terms.append((probability, self._worth_of(function.call(arguments))))
+                        function, arguments = self.call(branch, here)
+                        terms.append((probability, self.worth_of(function.call(arguments))))
                         continue
-                    written, count = _apply(branch.branch.model, here)
+                    written, count = applied(branch.branch.model, here)
                     instructions += count + 2
                     if branch.child is None:
                         reward = written[REWARD]
-                        terms.append((probability, _Worth(reward.mean, ca.densify(reward.covariance), [])))
+                        terms.append((probability, Worth(reward.mean, ca.densify(reward.covariance), [])))
                     else:
                         dictionaries[branch.child] = {**here, **written}
                         order.append(branch.child)
                         terms.append((probability, branch.child))
-        worths: dict[int, _Worth] = {}
+        worths: dict[int, Worth] = {}
         for index in reversed(order):
-            total = _Worth(ca.MX(self._tree.cut_value if self._tree.nodes[index].cut else 0.0), ca.MX(0.0), [])
+            total = Worth(ca.MX(self.tree.cut_value if self.tree.nodes[index].cut else 0.0), ca.MX(0.0), [])
             total.margins += margins[index]
             for terms in groups[index]:
-                mixed = [(p, worths.pop(term) if isinstance(term, int) else term) for p, term in terms]
-                total.add(_mixed(mixed, bool(self._risk)))
+                parts = [(p, worths.pop(term) if isinstance(term, int) else term) for p, term in terms]
+                total.add(mixed(parts, bool(self.risk)))
             worths[index] = total
         return worths[root], instructions
 
-    def _chain_from(self, index: int, here: Dictionary) -> Chain | None:
-        """Return the chain that begins at a node, if it can be written as one round again and again."""
-        chain = self._structure.chains.get(index)
-        if chain is None:
-            return None
-        # What is uncertain must be so after a round too, or rounds differ.
-        needed = self._structure.reads(index) | self._structure.reads(chain.end)
-        before = after = frozenset(label for label, g in here.items() if g.covariance.nnz())
-        for model in self._models_of(chain):
-            after = (after - set(model.writes)) | model.spread(after)
-        if before & needed == after & needed:
-            return chain
-        self._refused += 1
-        if self._refused > MOST_REFUSED:
-            raise _Unsteady
-        return None
-
-    def _models_of(self, chain: Chain) -> list[BoundModel]:
-        """Return the models by which a round leads to the next one."""
-        branches = [self._tree.nodes[node].groups[g].branches[b].branch for node, g, b in chain.steps]
-        return [branch.model for branch in branches if branch.model is not None]
-
-    def _fold(self, index: int, chain: Chain, here: Dictionary) -> tuple[ca.MX, ca.MX, Dictionary]:
-        """Write a chain.
-
-        Of rounds k with own rewards r_k and the probability p_k of going on, Σ_k r_k Π_{i<k} p_i is carried along. The
-        function of 2n rounds calls that of n twice, so that a chain takes few functions, however long it is.
-
-        Returns:
-            the probability that all go on, the expected rewards until then, the dictionary at the end.
-        """
-        slots = self._tree.graph.slots
-        written = {label for model in self._models_of(chain) for label in model.writes}
-        labels = sorted(self._structure.reads(index) | self._structure.reads(chain.end))
-        uncertain = {label for label in labels if label in here and here[label].covariance.nnz()}
-
-        def moments(of: Dictionary, wanted: bool) -> list[ca.MX]:
-            """Return what rounds change, or what they leave; what nobody has read yet may not exist."""
-            parts = []
-            for label in labels:
-                if (label in written) == wanted:
-                    known = of.get(label, Gaussian(ca.MX(slots[label].size, 1)))
-                    parts.append(ca.densify(known.mean))
-                    parts += [ca.densify(known.covariance)] if label in uncertain else []
-            return parts
-
-        start = {label: g for label, g in self._inputs.root.items() if not isinstance(slots[label], State)}
-        for label in labels:
-            n = slots[label].size
-            spread = ca.MX.sym(label, n, n) if label in uncertain else None
-            start[label] = Gaussian(ca.MX.sym(label, n), spread)
-        share, gained = ca.MX.sym("share"), ca.MX.sym("gained")
-        goes_on, own, after, instructions = self._round(chain, start)
-        constant = [*moments(start, False), *self._shared_symbols]
-        inputs = [share, gained, *moments(start, True), *constant]
-        results = [share * goes_on, gained + share * own, *moments(after, True)]
-        by = 2 if self._relaxed else 1
-        follows = [True] * (len(inputs) - len(self._shared_symbols) + by)
-        follows += [False] * (len(self._shared_symbols) - by)
-        options: dict[str, Any] = {"cse": True, "is_diff_in": follows}
-        function = ca.Function("round", inputs, results, options)
-        if instructions <= FLATTEN_LIMIT:
-            function = function.expand()
-        reached = [ca.MX(1.0), ca.MX(0.0), *moments(here, True)]
-        shared = [*moments(here, False), *self._shared_symbols]
-        rounds, count = chain.rounds, 1
-        while rounds:
-            if rounds % 2:
-                reached = function.call([*reached, *shared])
-            rounds, count = rounds // 2, 2 * count
-            if rounds:
-                twice = function.call([*function.call(inputs), *constant])
-                function = ca.Function(f"rounds_{count}", inputs, twice, options)
-        share, gained, *rest = reached
-        end = dict(here)
-        for label in labels:
-            if label in written:
-                mean = rest.pop(0)
-                end[label] = Gaussian(mean, rest.pop(0) if label in uncertain else None)
-        return share, gained, end
-
-    def _round(self, chain: Chain, here: Dictionary) -> tuple[ca.MX, ca.MX, Dictionary, float]:
-        """Write one round: the probability of going on, what it gains, what it leads to; also its instructions."""
-        goes_on, gained, instructions = ca.MX(1.0), ca.MX(0.0), 0.0
-        for index, onward_group, onward_branch in chain.steps:
-            own, after = _Worth(ca.MX(0.0), ca.MX(0.0), []), here
-            probability: ca.MX | float = 1.0
-            for g, group in enumerate(self._tree.nodes[index].groups):
-                terms: list[tuple[ca.MX | float, _Worth]] = []
-                model = group.group.probability
-                shares, count = _apply(model if isinstance(model, BoundModel) else None, here)
-                instructions += count
-                for b, branch in enumerate(group.branches):
-                    share = _share(branch, shares)
-                    if branch.child is not None and self._structure.apart[branch.child]:
-                        function, arguments = self._call(branch, here)
-                        terms.append((share, self._worth_of(function.call(arguments))))
-                        instructions = math.inf
-                        continue
-                    written, count = _apply(branch.branch.model, here)
-                    instructions += count + 2
-                    if (g, b) == (onward_group, onward_branch):
-                        probability, after = share, {**here, **written}
-                    elif branch.child is None:
-                        terms.append((share, _Worth(written[REWARD].mean, ca.MX(0.0), [])))
-                    else:
-                        worth, count = self._worth(branch.child, {**here, **written})
-                        terms.append((share, worth))
-                        instructions += count
-                own.add(_mixed(terms, spread=False))
-            gained += goes_on * own.value
-            goes_on, here = goes_on * probability, after
-        return goes_on, gained, here, instructions
-
-    def _results(self, worth: _Worth) -> list[ca.MX]:
+    def _results(self, worth: Worth) -> list[ca.MX]:
         """Return what a function of a branch hands on: value, variance if it is asked for, margins if there are any."""
-        variance = [ca.densify(worth.variance)] if self._risk else []
+        variance = [ca.densify(worth.variance)] if self.risk else []
         margins = [ca.densify(ca.vertcat(*worth.margins))] if worth.margins else []
         return [ca.densify(worth.value), *variance, *margins]
 
-    def _worth_of(self, results: list[ca.MX]) -> _Worth:
+    def worth_of(self, results: list[ca.MX]) -> Worth:
         """Read what `_results` returned."""
         value, *rest = results
-        return _Worth(value, rest.pop(0) if self._risk else ca.MX(0.0), rest)
+        return Worth(value, rest.pop(0) if self.risk else ca.MX(0.0), rest)
 
-    def _blend(self, group: TreeGroup, here: Dictionary) -> _Worth:
+    def _blend(self, group: TreeGroup, here: Dictionary) -> Worth:
         """Write a choice whose selection may be anything between its choices."""
-        shares = ca.vertsplit(self._inputs.root[str(group.group.selection)].mean)
+        shares = ca.vertsplit(self.inputs.root[str(group.group.selection)].mean)
         terms = []
         for share, branch in zip(shares, group.branches, strict=True):
-            function, arguments = self._call(branch, here)
-            worth = self._worth_of(function.call(arguments))
+            function, arguments = self.call(branch, here)
+            worth = self.worth_of(function.call(arguments))
             worth.margins = [share * margin for margin in worth.margins]
             terms.append((share, worth))
-        return _mixed(terms, bool(self._risk))
+        return mixed(terms, bool(self.risk))
 
-    def _switch(self, group: TreeGroup, here: Dictionary) -> _Worth:
+    def _switch(self, group: TreeGroup, here: Dictionary) -> Worth:
         """Write a choice: the function of the selected branch, the others not evaluated."""
-        slot = self._tree.graph.selections()[str(group.group.selection)]
-        calls = [self._call(branch, here) for branch in group.branches]  # in the order of the slot's choices
+        slot = self.tree.graph.selections()[str(group.group.selection)]
+        calls = [self.call(branch, here) for branch in group.branches]  # in the order of the slot's choices
         if len(calls) == 1:
-            return self._worth_of(calls[0][0].call(calls[0][1]))
+            return self.worth_of(calls[0][0].call(calls[0][1]))
         # All cases of a switch take the same arguments: those that any of them needs. And all return the margins of all
         # branches, in which those of the others do not count.
         arguments = {argument.__hash__(): argument for _, given in calls for argument in given}
         symbols = {key: ca.MX.sym("x", argument.sparsity()) for key, argument in arguments.items()}
-        unused = [[one.unused for one in constraints_of(self._tree, branch.child or 0)] for branch in group.branches]
+        unused = [[one.unused for one in constraints_of(self.tree, branch.child or 0)] for branch in group.branches]
         cases = []
         for i, (function, given) in enumerate(calls):
-            worth = self._worth_of(function.call([symbols[argument.__hash__()] for argument in given]))
+            worth = self.worth_of(function.call([symbols[argument.__hash__()] for argument in given]))
             before, after = ([ca.MX(ca.DM(part)) for part in parts] for parts in (unused[:i], unused[i + 1 :]))
             worth.margins = [*before, *worth.margins, *after] if any(unused) else []
             cases.append(ca.Function(f"case_{function.name()}", [*symbols.values()], self._results(worth)))
-        selection = self._inputs.root[str(group.group.selection)].mean
+        selection = self.inputs.root[str(group.group.selection)].mean
         index = ca.dot(selection, ca.DM(range(slot.size)))
         switch = ca.Function.conditional("choice", cases[:-1], cases[-1])
-        return self._worth_of(switch.call([index, *arguments.values()]))
-
-
-@dataclass
-class _Worth:
-    """What a subtree is worth: mean and variance of its sum of rewards, and the margins of its requirements."""
-
-    value: ca.MX
-    variance: ca.MX
-    margins: list[ca.MX]
-
-    def add(self, other: _Worth) -> None:
-        """Take in a group that happens side by side, independently."""
-        self.value += other.value
-        self.variance += other.variance
-        self.margins += other.margins
-
-
-def _mixed(terms: list[tuple[ca.MX | float, _Worth]], spread: bool) -> _Worth:
-    """Return the worth of a group of branches of which one happens: mean and, if asked for, variance of a mixture."""
-    margins = [margin for _, worth in terms for margin in worth.margins]
-    if len(terms) == 1 and isinstance(terms[0][0], float) and terms[0][0] == 1.0:
-        return _Worth(terms[0][1].value, terms[0][1].variance, margins)
-    value, variance = ca.MX(0.0), ca.MX(0.0)
-    for probability, worth in terms:
-        value += probability * worth.value
-    for probability, worth in terms if spread else ():
-        variance += probability * (worth.variance + (worth.value - value) ** 2)
-    return _Worth(value, variance, margins)
-
-
-def _share(branch: TreeBranch, shares: Dictionary) -> ca.MX | float:
-    """Return the probability of a branch, given what the group's model returned."""
-    label = branch.branch.label
-    share = shares[label].mean if label in shares else branch.share
-    return 1.0 if share is None else share
-
-
-def _apply(model: BoundModel | None, here: Dictionary) -> tuple[Dictionary, float]:
-    """Return what a model writes, and its scalar instructions: infinitely many where it cannot be flattened."""
-    if model is None:
-        return {}, 0.0
-    function, _ = model.moments(here)
-    return model.apply(here), function.n_instructions() if function.is_a("SXFunction") else math.inf
+        return self.worth_of(switch.call([index, *arguments.values()]))

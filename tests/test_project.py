@@ -33,6 +33,8 @@ LAYERS = [
     "compile",
     "structure",
     "constraints",
+    "worth",
+    "folding",
     "expectation",
     "outcomes",
     "situation",
