@@ -106,7 +106,8 @@ def merit(value: ca.MX, margins: ca.MX, multipliers: ca.MX, weights: ca.MX, cons
     pulled = multipliers + weights * margins
     equality = ca.DM([float(one.is_equality) for one in constraints])
     pulled = ca.if_else(equality, pulled, ca.fmax(pulled, 0.0))
-    penalties = ca.if_else(weights > 0.0, (pulled**2 - multipliers**2) / (2.0 * weights), 0.0)
+    divisor = 2.0 * weights + (weights <= 0.0)  # never 0: what has no part must not make slopes NaN either
+    penalties = ca.if_else(weights > 0.0, (pulled**2 - multipliers**2) / divisor, 0.0)
     return value - ca.sum1(penalties)
 
 

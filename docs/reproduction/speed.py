@@ -105,7 +105,7 @@ def forks(nodes):
     ways = {"a": ("here", lambda x, k: {"x": ca.sin(x + k)}), "b": ("here", lambda x, k: {"x": 0.9 * x - 0.1 * k * k})}
     graph.chance("here", ways, {"a": 0.4, "b": 0.6})
     graph.reward("here", lambda x: -(x**2))
-    return sg.unroll(graph, max_visits=max(1, int(np.log2(nodes + 1)) - 1)), {"x": 0.5}
+    return sg.unroll(graph, max_visits=int(np.ceil(np.log2(nodes + 1))) - 1), {"x": 0.5}
 
 
 def strangers(nodes):
@@ -123,6 +123,7 @@ def strangers(nodes):
     def reward(x):
         return -(x**2)
 
+    nodes += 1 - nodes % 2  # every fork has two branches
     for i in range(nodes):
         if 2 * i + 2 < nodes:
             p = 0.2 + 0.6 * (i * 37 % 101) / 101
