@@ -52,6 +52,9 @@ OUTER = of_columns("outer", lambda x, q: NESTED(x + q[0]) + NESTED(ca.cos(x)) * 
 SHIFT = of_columns("shift", lambda x, a: ca.sin(ca.reshape(ca.vertcat(x, x), 2, 4) @ a + 1), 4, 4)
 TWO = of_columns("two", lambda x, q: (LONG_MX(x) * q[0], LONG_SX(x) + ca.sum1(q)), 4, 3)
 EACH_SX = ca.Function("each", *(lambda x, y: ([x, y], [ca.sin(x * y) + x, x * y**2]))(ca.SX.sym("x"), ca.SX.sym("y")))
+COLUMN_OF = ca.Function(
+    "of", *(lambda x, y: ([x, y], [ca.vertcat(ca.sin(x * y), x, 3, y)]))(ca.SX.sym("x"), ca.SX.sym("y"))
+)
 EACH_COLUMN = of_columns("each_column", lambda x, q: LONG_MX(ca.vertcat(x, q[:2])) * q[2], 2, 3)
 
 # Cases of an index, of very different lengths and tapes.
@@ -108,6 +111,7 @@ CALLS = {
     "map of scalars": lambda x, k, w, q, b: ca.vertcat(*mapped(EACH_SX, 4, x.T, ca.sin(x).T)),
     "map of scalars that are bound": lambda x, k, w, q, b: ca.vertcat(*mapped(EACH_SX, 4, w[1, :], x.T)),
     "map of bound scalars alone": lambda x, k, w, q, b: ca.vertcat(*mapped(EACH_SX, 3, q.T, q.T + 1)),
+    "map of scalars to columns": lambda x, k, w, q, b: mapped(COLUMN_OF, 4, x.T, w[1, :]),
     "map of long scalars": lambda x, k, w, q, b: mapped(SCALAR_SX, 4, x.T),
     "map of columns": lambda x, k, w, q, b: mapped(LONG_SX, 3, ca.horzcat(x, ca.sin(x), w[0, :].T)),
     "map of matrices": lambda x, k, w, q, b: mapped(LONG_MX, 5, x * w.T),

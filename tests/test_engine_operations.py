@@ -59,6 +59,10 @@ CASES = {
     "row": lambda x, y, v, p, q, k, b: x[-1, :],
     "rows and columns": lambda x, y, v, p, q, k, b: x[[0, 2], [3, 1, 1]],
     "numbers, some twice": lambda x, y, v, p, q, k, b: v[[0, 3, 3, 5, 0]],
+    "number among others": lambda x, y, v, p, q, k, b: ca.sin(v) * ca.cos(v)[4],
+    "numbers among others": lambda x, y, v, p, q, k, b: (
+        ca.sin(x) * ca.tanh(x)[2, 1] + ca.exp(x) / (3 + ca.cos(x)[0, 0])
+    ),
     "part of what is sparse": lambda x, y, v, p, q, k, b: lower(x)[1:, :2],
     "part of what is bound": lambda x, y, v, p, q, k, b: p[1::2, :] @ x @ p[:, [2, 2, 0]],
     "set": lambda x, y, v, p, q, k, b: with_part(x, (slice(0, 2), 1), v[:2]),

@@ -167,6 +167,9 @@ class _Sweep:
         self._parts: dict[Value, list[tuple[Value, Indices]]] = {}  # and of some of a value's numbers
         self._taped: dict[Operation, tuple[Program, ...]] = {}  # calls and the programs that reverse them
         self._zero = target.constant(0.0)
+        # Values whose adjoints a condition may set to zero: slopes there, which may not be finite, must not count.
+        self._guarded: set[Value] = set()
+        self._guards = False  # whether the adjoint that is passed on is one of them
 
     def forward(self, source: Program) -> list[Value]:
         """Write a program, and keep a tape of what it calls."""
@@ -200,7 +203,11 @@ class _Sweep:
             if operation.outputs and any(output.kind == Kind.LANE for output in operation.outputs):
                 adjoints = [self._taken(output) for output in operation.outputs]
                 if any(adjoint is not None for adjoint in adjoints):
+                    self._guards = operation.code == ca.OP_IF_ELSE_ZERO or not self._guarded.isdisjoint(
+                        operation.outputs
+                    )
                     self._pass_on(operation, adjoints)
+                    self._guards = False
 
     def adjoint(self, value: Value) -> Value:
         """Return the adjoint of an input."""
@@ -210,6 +217,8 @@ class _Sweep:
         if value.kind < Kind.LANE or _is_zero(adjoint):
             return
         target = self._target
+        if self._guards:
+            self._guarded.add(value)
         if value.size == 1 < adjoint.size:
             adjoint = target.total(adjoint)
         if adjoint.size == 1 < value.size:
@@ -219,6 +228,8 @@ class _Sweep:
 
     def _give_some(self, value: Value, adjoint: Value, where: Indices) -> None:
         if value.kind == Kind.LANE and where.size:
+            if self._guards:
+                self._guarded.add(value)
             self._parts.setdefault(value, []).append((adjoint, where))
 
     def _taken(self, value: Value) -> Value | None:
@@ -261,9 +272,11 @@ class _Sweep:
             m, k, n = operation.detail
             left, right = args
             if left.kind == Kind.LANE:
-                self._give(left, target.product(adjoint, target.transpose(right, k, n), (m, n, k)))
+                given = target.product(adjoint, target.transpose(right, k, n), (m, n, k))
+                self._give(left, given if adjoint.size > 1 else self._times(adjoint, given))
             if right.kind == Kind.LANE:
-                self._give(right, target.product(target.transpose(left, m, k), adjoint, (k, m, n)))
+                given = target.product(target.transpose(left, m, k), adjoint, (k, m, n))
+                self._give(right, given if adjoint.size > 1 else self._times(adjoint, given))
         else:
             targets, *indices = operation.detail
             if len(args) == 1:
@@ -271,33 +284,39 @@ class _Sweep:
                 return
             for this, other in ((0, 1), (1, 0)):
                 if args[this].kind == Kind.LANE:
-                    given = [adjoint, args[other]]
+                    factors = [adjoint, args[other]]
                     terms = [targets, indices[other]]
-                    self._give(args[this], target.accumulate(args[this].size, indices[this], given, terms))
+                    given = target.accumulate(args[this].size, indices[this], factors, terms)
+                    self._give(args[this], given if adjoint.size > 1 else self._times(adjoint, given))
 
     def _reverse_elementwise(self, operation: Operation, adjoint: Value) -> None:
         target, args, result = self._target, operation.args, operation.outputs[0]
         code = int(operation.code)
         if code == ca.OP_DIV:
-            share = target.elementwise(ca.OP_DIV, adjoint, args[1])
+            share = self._times(adjoint, target.elementwise(ca.OP_DIV, adjoint, args[1]))
             self._give(args[0], share)
             if args[1].kind == Kind.LANE:
                 loss = target.elementwise(ca.OP_MUL, share, result)
-                self._give(args[1], target.elementwise(ca.OP_NEG, loss))
+                self._give(args[1], target.elementwise(ca.OP_NEG, self._times(adjoint, loss)))
         elif code == ca.OP_SQRT:
             half = target.elementwise(ca.OP_MUL, target.constant(0.5), adjoint)
-            self._give(args[0], target.elementwise(ca.OP_DIV, half, result))
+            self._give(args[0], self._times(adjoint, target.elementwise(ca.OP_DIV, half, result)))
         elif code in (ca.OP_FMAX, ca.OP_FMIN):
             for one, other in (args, args[::-1]):
                 if one.kind == Kind.LANE:
                     slope = target.elementwise(STEP, *((one, other) if code == ca.OP_FMAX else (other, one)))
-                    self._give(one, target.elementwise(ca.OP_MUL, slope, adjoint))
+                    self._give(one, self._times(adjoint, target.elementwise(ca.OP_MUL, slope, adjoint)))
         elif code == ca.OP_IF_ELSE_ZERO:
             self._give(args[1], target.elementwise(code, args[0], adjoint))
         else:
             for arg, slope in zip(args, self._slopes(code, args), strict=True):
                 if arg.kind == Kind.LANE and not _is_zero(slope):
-                    self._give(arg, target.elementwise(ca.OP_MUL, slope, adjoint))
+                    given = target.elementwise(ca.OP_MUL, slope, adjoint)
+                    self._give(arg, given if constant_of(slope) is not None else self._times(adjoint, given))
+
+    def _times(self, adjoint: Value, product: Value) -> Value:
+        """Return an elementwise product with an adjoint, 0 where a condition may have set the adjoint to 0."""
+        return self._target.elementwise(ca.OP_IF_ELSE_ZERO, adjoint, product) if self._guards else product
 
     def _slopes(self, code: int, args: Sequence[Value]) -> list[Value]:
         return write_scalars(self._target, _slope_function(code, len(args)), args, each=True, spread=False)

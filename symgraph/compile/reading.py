@@ -82,6 +82,7 @@ class Reader:
                 inner.is_a("SXFunction")
                 and not _calls(inner)
                 and all(inner.numel_in(i) == 1 for i in range(inner.n_in()))
+                and all(inner.numel_out(i) == 1 for i in range(inner.n_out()))
             ):
                 return write_scalars(program, inner, args, each=True)
             detail = (self.program(kinds, inner), times)

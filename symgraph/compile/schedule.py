@@ -94,12 +94,15 @@ class Schedule:
         for operation in self._program.operations:
             if operation.code == "constant" or operation.outputs[0] in self._aliases:
                 continue
-            makers = [self._made_by(arg) for arg in operation.args]
-            needed = dict.fromkeys(owner[maker] for maker in makers if maker is not None and maker in owner)
             size = operation.outputs[0].size if operation.is_elementwise else -1
+            needed: dict[int, None] = {}
+            for arg in operation.args:
+                maker = self._made_by(arg)
+                # One number of an array is complete only after the loop that makes the array.
+                if maker is not None and maker in owner and not (owner[maker] == size == arg.size):
+                    needed[owner[maker]] = None
             for other in needed:
-                if other != size:
-                    yield close(other)
+                yield close(other)
             if size < 0:
                 yield [operation]
                 continue
