@@ -33,7 +33,8 @@ class Objective:
         risk: J becomes E[Σ rewards] - risk · sd[Σ rewards]; rewards on the way through the tree count as independent of
             each other, as slots do.
         precision: of compiled code. In "single" wide networks take half the time, and searches end some 1e-6 of J's
-            size before they would in "double"; what a plan says of itself is computed in double either way.
+            size before they would in "double"; numbers above 3e38 are infinite there. What a plan says of itself is
+            computed in double either way.
 
     Raises:
         InputError: no tree, a risk that is no finite number, or no such precision.

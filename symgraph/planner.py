@@ -61,8 +61,8 @@ def solve(
         fixed: {label: value} of actions and selections that are held.
         seed: of all that is random; the same seed gives the same plan, unless time runs out.
         time_limit: after which the best so far is returned [s]; building and compiling at first use come on top.
-        threads: that share the start points where J is compiled; plans are the same. More than one pays where a
-            gradient takes long, as with wide networks.
+        threads: that share the work where J is compiled; plans are the same. More than one pays where a gradient
+            takes long, as with wide networks, and where there is a free core for each.
         progress: show a progress bar where it takes longer than two seconds.
 
     Raises:

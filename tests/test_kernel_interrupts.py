@@ -12,9 +12,9 @@ import pytest
 from small_tasks import over_box
 from wrapped_kernels import ctrl_c_after
 
-from symgraph.compile import compiled as compiled_module
 from symgraph.compile import toolchain
 from symgraph.compile.compiled import CompiledKernel
+from symgraph.compile.crew import Crew
 from symgraph.compile.interpreted import InterpretedKernel
 from symgraph.compile.kernel import AdadeltaSteps, Stop
 
@@ -130,23 +130,23 @@ def test_ctrl_c_waits_for_the_other_threads():
     """They write to arrays that would be gone."""
     done = []
 
-    def work(seconds):
+    def work(member, seconds):
         time.sleep(seconds)
         done.append(seconds)
 
     with pytest.raises(KeyboardInterrupt), ctrl_c_after(0.2):
-        compiled_module._side_by_side(work, [(0.0,), (1.0,), (1.1,)])
+        Crew(3, 1).work(work, [(0.0,), (1.0,), (1.1,)])
     assert done == [0.0, 1.0, 1.1]
 
 
 def test_what_a_thread_raises_is_raised():
-    def work(number):
+    def work(member, number):
         if number:
             raise ValueError(number)
 
     for place in range(3):
         with pytest.raises(ValueError, match="7"):
-            compiled_module._side_by_side(work, [(7 * (i == place),) for i in range(3)])
+            Crew(3, 1).work(work, [(7 * (i == place),) for i in range(3)])
 
 
 def test_a_forked_process_has_threads_of_its_own():

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
-import os
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from collections.abc import Iterator, Sequence
 from functools import cache, cached_property
 from importlib import resources
 from itertools import pairwise
@@ -17,6 +15,7 @@ from typing import Any, get_args
 import casadi as ca
 import numpy as np
 
+from symgraph.compile.crew import Crew
 from symgraph.compile.kernel import NEVER, AdadeltaSteps, BoundKernel, Ended, Kernel, Outcome, Stop
 from symgraph.compile.rules import rules_in
 from symgraph.compile.source import kernel_source
@@ -73,15 +72,18 @@ class CompiledKernel(Kernel):
             warnings.warn(f"{error}\nsingle points are computed by code for many, which is slower", stacklevel=2)
             return self.wide
 
+    def compile_for_one(self) -> None:
+        self.narrow  # noqa: B018 compiled when it is first asked for
+
     def library(self, count: int) -> Library:
         """Return the code that is best for so many points."""
         return self.narrow if count == 1 else self.wide
 
-    def prepared(self, library: Library, columns: Sequence[Array]) -> _Prepared:
+    def prepared(self, library: Library, columns: Sequence[Array], threads: int) -> _Prepared:
         """Return what follows from bound inputs; the last of them is kept, since many calls come with the same ones."""
         last = self._prepared.get(id(library))
         if last is None or not last.serves(columns):
-            last = self._prepared[id(library)] = _Prepared(library, columns)
+            last = self._prepared[id(library)] = _Prepared(library, columns, threads)
         return last
 
     def __reduce__(self) -> tuple[Any, ...]:  # other processes load the libraries from the cache
@@ -105,17 +107,18 @@ class Library:
         pointer: Any = ctypes.c_void_p
         whole: Any = ctypes.c_longlong
         code.symgraph_sizes.argtypes = [pointer]
-        code.symgraph_bind.argtypes = [pointer] * 3
-        code.symgraph_evaluate.argtypes = [whole, *[pointer] * 7]
+        code.symgraph_bind.argtypes = [pointer] * 4
+        code.symgraph_evaluate.argtypes = [pointer, whole, *[pointer] * 7]
         code.symgraph_begin.argtypes = [pointer, pointer, pointer, whole, whole, *[pointer] * 9]
-        code.symgraph_advance.argtypes = [pointer, pointer, pointer, whole]
+        code.symgraph_advance.argtypes = [pointer, pointer, pointer, pointer, whole]
         for name in ("sizes", "bind", "evaluate", "begin", "advance"):
             getattr(code, f"symgraph_{name}").restype = None
         self.code = code
         self.real = np.dtype(np.float32 if single else np.float64)
-        sizes = (ctypes.c_longlong * 4)()
+        sizes = (ctypes.c_longlong * 5)()
         code.symgraph_sizes(sizes)
-        self.block, self.early_work, self.work, self.search_bytes = sizes
+        self.block, self.early_work, self.work, self.search_bytes, shared = sizes
+        self.shared = bool(shared)  # whether the members of a team share each evaluation; else threads share points
 
 
 class _Settings(ctypes.Structure):
@@ -138,14 +141,15 @@ class _Settings(ctypes.Structure):
 class _Prepared:
     """Bound inputs of a library, and what follows from them; only read from here on, by any thread."""
 
-    def __init__(self, library: Library, columns: Sequence[Array]) -> None:
+    def __init__(self, library: Library, columns: Sequence[Array], threads: int) -> None:
         # Others may write to their own numbers later.
         self._columns = [column.copy() if column.flags.writeable else column for column in columns]
         block, early = aligned(library.block, library.real), aligned(library.early_work, library.real)
         self._kept = [*(np.ascontiguousarray(column, dtype=library.real) for column in self._columns), block]
         self._pointers = (ctypes.c_void_p * len(self._kept))(*[address(column) for column in self._kept])
         self.address = ctypes.addressof(self._pointers)
-        library.code.symgraph_bind(self.address, address(block), address(early))
+        given = self.address, address(block), address(early)
+        Crew(1, threads if library.shared else 1).work(library.code.symgraph_bind, [given])
 
     def serves(self, columns: Sequence[Array]) -> bool:
         """Whether other inputs are the same: the same memory, which nobody can change, or the same few numbers."""
@@ -157,13 +161,15 @@ class _Prepared:
 
 
 class _Inputs:
-    """What a library needs to evaluate: bound inputs, and workspace for each thread."""
+    """What a library needs to evaluate: bound inputs, threads, and workspace for each of their teams."""
 
     def __init__(self, library: Library, prepared: _Prepared, threads: int) -> None:
         self.library = library
         self._prepared = prepared
         self.shared = prepared.address
-        self._workspaces = [aligned(library.work, library.real) for _ in range(threads)]
+        self.teams, members = (1, threads) if library.shared else (threads, 1)
+        self.crew = Crew(self.teams, members)
+        self._workspaces = [aligned(library.work, library.real) for _ in range(self.teams)]
         self.work = [address(workspace) for workspace in self._workspaces]
 
 
@@ -182,7 +188,7 @@ class _BoundCompiled(BoundKernel):
     def _for(self, count: int) -> _Inputs:
         library = self._kernel.library(count)
         if id(library) not in self._inputs:
-            prepared = self._kernel.prepared(library, self._given[0])
+            prepared = self._kernel.prepared(library, self._given[0], self._threads)
             self._inputs[id(library)] = _Inputs(library, prepared, self._threads)
         return self._inputs[id(library)]
 
@@ -193,14 +199,14 @@ class _BoundCompiled(BoundKernel):
             points, chosen = points[order], chosen[order]
         inputs, stop = self._for(len(points)), self._given[3].address
         values, gradients = np.empty(len(points)), np.empty(points.shape)
-        edges = [len(points) * thread // self._threads for thread in range(self._threads + 1)]
+        edges = [len(points) * team // inputs.teams for team in range(inputs.teams + 1)]
         parts = [[array[a:b] for array in (points, chosen, values, gradients)] for a, b in pairwise(edges) if b > a]
 
-        def work(part: list[Array], workspace: int) -> None:
+        def work(member: int, part: list[Array], workspace: int) -> None:
             x, h, v, g = map(address, part)
-            inputs.library.code.symgraph_evaluate(len(part[0]), x, h, inputs.shared, stop, v, g, workspace)
+            inputs.library.code.symgraph_evaluate(member, len(part[0]), x, h, inputs.shared, stop, v, g, workspace)
 
-        _side_by_side(work, list(zip(parts, inputs.work, strict=False)))
+        inputs.crew.work(work, list(zip(parts, inputs.work, strict=False)))
         if order is None:
             return values, gradients
         in_turn = np.empty_like(values), np.empty_like(gradients)
@@ -246,55 +252,26 @@ class _BoundCompiled(BoundKernel):
         outcomes, spent = np.full(count, _UNDER_WAY, dtype=np.intc), np.zeros(count, dtype=np.longlong)
         pointers = [address(column) for column in (*given, ends, values, histories, outcomes, spent)]
         all_settings = _Settings(low=address(low), high=address(high), stop=stop.address, **settings)
-        following = ctypes.c_long(0)  # the first start that waits, for all threads
+        following = ctypes.c_long(0)  # the first start that waits, for all searches
         searches = [np.empty(inputs.library.search_bytes, dtype=np.uint8) for _ in inputs.work]
         for search in searches:
             shares = address(search), ctypes.addressof(all_settings), ctypes.addressof(following), len(searches)
             code.symgraph_begin(*shares, count, *pointers)
 
-        def work(search: Array, workspace: int) -> None:
-            code.symgraph_advance(address(search), inputs.shared, workspace, rounds)
+        def work(member: int, search: Array, workspace: int) -> None:
+            code.symgraph_advance(member, address(search), inputs.shared, workspace, rounds)
 
         rounds, waiting, over = FIRST_ROUNDS, np.ones(count, dtype=bool), False
         while waiting.any() and not over:
             begin = perf_counter()
             over = bool(stop) and not waiting.all()  # one last round, in which walks that are under way end
             rounds = 1 if over else rounds
-            _side_by_side(work, list(zip(searches, inputs.work, strict=True)))
+            inputs.crew.work(work, list(zip(searches, inputs.work, strict=True)))
             rounds = max(1, min(4 * rounds, int(rounds * SLICE / max(perf_counter() - begin, 1e-9))))
             for p in np.flatnonzero(waiting & (outcomes != _UNDER_WAY)):
                 waiting[p] = False
                 outcome, history = _OUTCOMES[outcomes[p]], histories[p, : spent[p]].copy()
                 yield int(order[p]), Ended(ends[p].copy(), float(values[p]), outcome, history)
-
-
-def _side_by_side(work: Callable[..., None], arguments: list[tuple[Any, ...]]) -> None:
-    """Call a function with each of several arguments, in threads of their own; return when all are done."""
-    if len(arguments) <= 1:
-        for given in arguments:
-            work(*given)
-        return
-    futures: list[Future[None]] = []
-    interrupt: KeyboardInterrupt | None = None
-    try:
-        futures.extend(_pool(os.getpid()).submit(work, *given) for given in arguments[1:])
-        work(*arguments[0])
-    finally:
-        while not all(future.done() for future in futures):  # arrays must stay until nobody writes to them
-            try:
-                wait(futures)
-            except KeyboardInterrupt as error:
-                interrupt = error
-    if interrupt is not None:
-        raise interrupt
-    for future in futures:
-        future.result()
-
-
-@cache
-def _pool(process: int) -> ThreadPoolExecutor:
-    """Return the threads of a process; a forked one has none of its parent's."""
-    return ThreadPoolExecutor(thread_name_prefix=f"symgraph-{process}")
 
 
 def _by_selection(selections: Array) -> Choices | None:

@@ -93,10 +93,12 @@ class Hoister:
             m, k, n = operation.detail
             maker = left.maker
             # A point alone is bound by how fast weights can be read: squares are better made anew.
-            squared = not self._lanes and maker is not None and maker.code == ca.OP_SQ
-            left = maker.args[0] if squared and maker is not None else left
-            transposed = left.maker is not None and left.maker.code == "transpose"
-            left = left.maker.args[0] if transposed and left.maker is not None else left
+            square = maker.args[0] if maker is not None and maker.code == ca.OP_SQ else None
+            squared = square is not None and not self._lanes
+            plain = left if square is None else square
+            transposed = plain.maker is not None and plain.maker.code == "transpose"
+            plain = plain.maker.args[0] if transposed and plain.maker is not None else plain
+            left = plain if square is None or squared else whole.elementwise(ca.OP_SQ, plain)
             shape = m, k, transposed
             (packed,) = whole.add("pack", (left,), shape, [-(-m // PANEL) * PANEL * k], shape)
             detail = m, k, n, squared

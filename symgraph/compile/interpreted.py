@@ -66,6 +66,9 @@ class InterpretedKernel(Kernel):
     ) -> BoundKernel:
         return _BoundInterpreted(self.function, list(shared), low, high, stop)
 
+    def compile_for_one(self) -> None:
+        """There is nothing to compile."""
+
 
 class _BoundInterpreted(BoundKernel):
     def __init__(self, function: FlatFunction, shared: list[Array], low: Array, high: Array, stop: Stop) -> None:

@@ -139,3 +139,7 @@ class Kernel(ABC):
             stop: ends a search, and an evaluation of many points, after at least one gradient.
             threads: that share the points of one call, where that is possible.
         """
+
+    @abstractmethod
+    def compile_for_one(self) -> None:
+        """Compile ahead what a search from one point needs."""

@@ -1,6 +1,7 @@
 /* Local search from many points side by side, next to the gradient: projected L-BFGS and ADADELTA.
 
-   C99 but for atomic operations, libm only, no allocation, no globals. The file that includes this one defines
+   C99 but for atomic operations, libm only, no allocation, no globals. Before this file stands team.c; the file that includes
+   this one defines
      N_ACTIONS, N_SELECTIONS    numbers of stacked actions, and of choices
      MOST_LANES                 points that are evaluated side by side
      fill, evaluate             how many lanes are worked on for so many points; values and gradients of B lanes
@@ -14,7 +15,7 @@ struct lanes {
   const void *given; /* what evaluate needs besides */
 };
 static int fill(long count);
-static void evaluate(const struct lanes *lanes, long B);
+static void evaluate(const struct lanes *lanes, long B, struct member *me);
 
 enum outcome { UNDER_WAY = -1, CONVERGED, ITERATION_LIMIT, OSCILLATION, STALLED, NOT_FINITE, TIME_LIMIT };
 
@@ -352,8 +353,8 @@ static int ascend(struct walk *k, const struct settings *set, double value, doub
 struct search {
   struct settings set;
   long count, active; /* points, and walks under way here */
-  long *next;         /* the first point that waits, for all threads */
-  long most;          /* walks at once: threads share few points evenly */
+  long *next;         /* the first point that waits, for all searches */
+  long most;          /* walks at once: searches share few points evenly */
   const double *points, *chosen, *tolerances, *scales; /* (count, N_ACTIONS), (count, N_SELECTIONS), (count), (count) */
   double *ends, *values, *histories;                   /* (count, N_ACTIONS), (count), (count, limit) */
   int *outcomes;                                       /* (count), UNDER_WAY at first */
@@ -404,43 +405,59 @@ static real within(double x, double low, double high) {
   return y;
 }
 
-/* Evaluate all walks once and let each make a step, `rounds` times or until none is left. */
-static void advance(struct search *all, const struct lanes *lanes, long rounds) {
-  for (; rounds > 0; --rounds) {
-    long b, B, left = 0;
-    int i;
-    for (;;) { /* a point takes a place if it has the same selections as the others */
-      long start = __atomic_load_n(all->next, __ATOMIC_RELAXED);
-      if (all->active >= all->most || start >= all->count) break;
-      if (all->active && memcmp(all->chosen + start * N_SELECTIONS, all->chosen + all->walks[0].start * N_SELECTIONS,
-                                N_SELECTIONS * sizeof(double)))
-        break;
-      if (__atomic_compare_exchange_n(all->next, &start, start + 1, 0, __ATOMIC_RELAXED, __ATOMIC_RELAXED))
-        begin_walk(all->walks + all->active++, all, start);
-    }
-    if (!all->active) return;
-    B = fill(all->active);
-    for (b = 0; b < B; ++b) {
-      const struct walk *k = all->walks + (b < all->active ? b : 0);
-      for (i = 0; i < N_ACTIONS; ++i) lanes->x[i * B + b] = within(k->x[i], all->set.low[i], all->set.high[i]);
-      for (i = 0; i < N_SELECTIONS; ++i) lanes->chosen[i * B + b] = (real) all->chosen[k->start * N_SELECTIONS + i];
-    }
-    evaluate(lanes, B);
-    for (b = 0; b < all->active; ++b) {
-      struct walk *k = all->walks + b;
-      double *const gradient = k->scratch[2];
-      for (i = 0; i < N_ACTIONS; ++i) gradient[i] = (double) lanes->gradient[i * B + b];
-      if ((all->set.ascends ? ascend : climb)(k, &all->set, (double) lanes->value[b], gradient)) {
-        if (left < b) {
-          all->walks[left] = *k;
-          all->walks[left].pairs.s = all->walks[left].s;
-          all->walks[left].pairs.y = all->walks[left].y;
-        }
-        ++left;
-      } else {
-        end_walk(k, all);
+/* Let points that wait take places; then say where all walks are to be evaluated. Returns for how many lanes. */
+static long prepare(struct search *all, const struct lanes *lanes) {
+  long b, B;
+  int i;
+  for (;;) { /* a point takes a place if it has the same selections as the others */
+    long start = __atomic_load_n(all->next, __ATOMIC_RELAXED);
+    if (all->active >= all->most || start >= all->count) break;
+    if (all->active && memcmp(all->chosen + start * N_SELECTIONS, all->chosen + all->walks[0].start * N_SELECTIONS,
+                              N_SELECTIONS * sizeof(double)))
+      break;
+    if (__atomic_compare_exchange_n(all->next, &start, start + 1, 0, __ATOMIC_RELAXED, __ATOMIC_RELAXED))
+      begin_walk(all->walks + all->active++, all, start);
+  }
+  if (!all->active) return 0;
+  B = fill(all->active);
+  for (b = 0; b < B; ++b) {
+    const struct walk *k = all->walks + (b < all->active ? b : 0);
+    for (i = 0; i < N_ACTIONS; ++i) lanes->x[i * B + b] = within(k->x[i], all->set.low[i], all->set.high[i]);
+    for (i = 0; i < N_SELECTIONS; ++i) lanes->chosen[i * B + b] = (real) all->chosen[k->start * N_SELECTIONS + i];
+  }
+  return B;
+}
+
+/* Let each walk make a step, after it was evaluated; those that have ended leave their places. */
+static void step_all(struct search *all, const struct lanes *lanes, long B) {
+  long b, left = 0;
+  int i;
+  for (b = 0; b < all->active; ++b) {
+    struct walk *k = all->walks + b;
+    double *const gradient = k->scratch[2];
+    for (i = 0; i < N_ACTIONS; ++i) gradient[i] = (double) lanes->gradient[i * B + b];
+    if ((all->set.ascends ? ascend : climb)(k, &all->set, (double) lanes->value[b], gradient)) {
+      if (left < b) {
+        all->walks[left] = *k;
+        all->walks[left].pairs.s = all->walks[left].s;
+        all->walks[left].pairs.y = all->walks[left].y;
       }
+      ++left;
+    } else {
+      end_walk(k, all);
     }
-    all->active = left;
+  }
+  all->active = left;
+}
+
+/* Evaluate all walks once and let each make a step, `rounds` times or until none is left. */
+static void advance(struct member *me, struct search *all, const struct lanes *lanes, long rounds) {
+  struct team *const team = me->team;
+  for (; rounds > 0; --rounds) {
+    if (me->index == 0) team->lanes = prepare(all, lanes);
+    meet(me);
+    if (!team->lanes) return;
+    evaluate(lanes, team->lanes, me);
+    if (me->index == 0) step_all(all, lanes, team->lanes);
   }
 }

@@ -10,7 +10,7 @@ from symgraph.compile.differentiate import Differentiator
 from symgraph.compile.hoist import Hoister
 from symgraph.compile.program import Kind, Program
 from symgraph.compile.reading import Reader
-from symgraph.compile.writing import Writer
+from symgraph.compile.writing import Writer, signature
 
 MOST_LANES = (64, 32, 16)  # points that are evaluated side by side: as many as have room in the cache
 CACHE = 6e6  # bytes of workspace that are still read fast
@@ -34,21 +34,30 @@ def kernel_source(function: ca.Function, lanes: bool, single: bool) -> str:
         "N_SHARED": function.n_in() - 2,
         "MOST_LANES": _most_lanes(late_work) if lanes else 1,
         "BLOCK": early.outputs[0].size,
-        "EARLY": early_name,
         "EARLY_WORK": early_work,
-        "LATE": late_name,
         "LATE_WORK": late_work,
+        "SHARED": int(writer.sharing.of_program(late)),
     }
     parts = [
         _PRECISION[single],
         _text("lanes.c"),
         _text("products.c"),
+        _text("team.c"),
         writer.text(),
+        _entry("early", early_name, writer.sharing.of_program(early)),
+        _entry("late", late_name, writer.sharing.of_program(late)),
         *(f"#define {name} {value}" for name, value in numbers.items()),
         _text("search.c"),
         _text("kernel.c"),
     ]
     return "\n".join(parts)
+
+
+def _entry(name: str, function: str, shared: bool) -> str:
+    """Return a function that all members of a team call, whether or not they share what it does."""
+    call = f"{function}(arg, res, w, B{', me' * shared});"
+    body = call if shared else f"if (me->index == 0) {call}\n  meet(me);"
+    return f"static void {name}{signature(shared=True)} {{\n  {body}\n}}"
 
 
 def _most_lanes(work: int) -> int:

@@ -8,9 +8,11 @@ from itertools import islice
 import casadi as ca
 import numpy as np
 
+from symgraph.compile.differentiate import called
 from symgraph.compile.loops import Loop, number
-from symgraph.compile.program import Indices, Operation, Program, Value, constant_of
+from symgraph.compile.program import CALLS, Indices, Operation, Program, Value, constant_of
 from symgraph.compile.schedule import Schedule, Step
+from symgraph.compile.sharing import Access, By, Meetings, Sharing
 
 PART = 1000  # operations of one C function: the compiler's time grows faster than a function's length
 MOST_RUNS = 12  # copies that are written out; beyond that a table says what goes where
@@ -20,10 +22,12 @@ class Writer:
     """Writes C functions for programs and those that they call, each once.
 
     A function takes its inputs, its outputs, workspace and the number of lanes. With lanes, a number that is not bound
-    is a row of as many numbers, one for each; the function does the same to all of them.
+    is a row of as many numbers, one for each; the function does the same to all of them. A function that several
+    threads share also takes the member of their team that calls it; when it returns all of them have done all of it.
     """
 
     def __init__(self) -> None:
+        self.sharing = Sharing()
         self._functions: dict[tuple[Program, bool], tuple[str, int]] = {}
         self._tables: dict[tuple[str, bytes], str] = {}
         self._externals: dict[int, tuple[ca.Function, ca.Function]] = {}
@@ -81,6 +85,8 @@ class _FunctionWriter:
         self._lanes = lanes
         self._name = name
         self._schedule = Schedule(program, lanes)
+        self._shared = writer.sharing.of_program(program)
+        self._meetings = Meetings()
         self._below = 0  # workspace of what is called
         self._lines: list[str] = []
         self._parts: list[str] = []
@@ -88,23 +94,76 @@ class _FunctionWriter:
     def write(self) -> int:
         count = 0
         for step in self._schedule.steps:
+            begin = len(self._lines)
             self._write_step(step)
+            if self._shared:
+                self._share(step, begin)
             count += len(step)
             if count >= PART:
                 self._end_part()
                 count = 0
         self._write_outputs()
         self._end_part()
-        calls = "\n".join(f"  {part}(arg, res, w, B);" for part in self._parts)
-        self._writer.add(f"static void {self._name}{_SIGNATURE} {{\n{calls}\n}}")
+        calls = "\n".join(f"  {part}(arg, res, w, B{', me' * self._shared});" for part in self._parts)
+        self._writer.add(f"static void {self._name}{signature(self._shared)} {{\n{calls}\n}}")
         return self._schedule.work + self._below
 
     def _end_part(self) -> None:
         if self._lines:
             name = f"{self._name}_{len(self._parts)}"
-            self._writer.add(f"static void {name}{_SIGNATURE} {{\n" + "\n".join(self._lines) + "\n}")
+            self._writer.add(f"static void {name}{signature(self._shared)} {{\n" + "\n".join(self._lines) + "\n}")
             self._parts.append(name)
             self._lines = []
+
+    # threads
+
+    def _share(self, step: Step, begin: int) -> None:
+        """Let the threads of a team do a step, whose lines begin there, together or by the first one alone."""
+        if len(self._lines) == begin:
+            return
+        if self._calls_shared(step[0]):
+            due = self._meetings.is_due
+            self._meetings.hold()  # what is called ends with a meeting
+        else:
+            due = self._meetings.needed(self._accesses(step))
+            if not Sharing.of_step(step):
+                self._by_first(begin)
+        if due:
+            self._lines.insert(begin, "  meet(me);")
+
+    def _by_first(self, begin: int) -> None:
+        self._lines[begin:] = ["  if (me->index == 0) {", *self._lines[begin:], "  }"]
+
+    def _calls_shared(self, operation: Operation) -> bool:
+        return operation.code in CALLS and any(map(self._writer.sharing.of_program, called(operation)))
+
+    def _accesses(self, step: Step) -> list[Access]:
+        """Return what a step reads and writes."""
+        size = step[0].outputs[0].size
+        made = [output for operation in step for output in operation.outputs]
+        within = set(made)
+        if step[0].is_elementwise:
+            made = [output for output in made if self._schedule.is_used_later(output, step)]
+        shared = Sharing.of_step(step)
+
+        def by(value: Value, writes: bool) -> By:
+            if not shared:
+                return By.FIRST
+            if step[0].is_elementwise:
+                return By.ROWS if value.size == size else By.ALL
+            # Of a packed matrix, and of a result with several columns, rows do not lie together.
+            return By.ROWS if writes and step[0].code == "packed product" and step[0].detail[2] == 1 else By.ALL
+
+        return [
+            Access(self._schedule.place(value), value.size, by(value, writes), writes)
+            for values, writes in (((arg for o in step for arg in o.args if arg not in within), False), (made, True))
+            for value in values
+            if constant_of(self._schedule.source(value)) is None
+        ]
+
+    def _rows(self, size: int) -> tuple[str, str]:
+        """Return from which row on and up to which one this thread does a step."""
+        return (f"row_of(me, 0, {size})", f"row_of(me, 1, {size})") if self._shared else ("0", str(size))
 
     # where things are
 
@@ -140,7 +199,8 @@ class _FunctionWriter:
         for operation in step:
             loop.add(operation)
         stored = [o.outputs[0] for o in step if self._schedule.is_used_later(o.outputs[0], step)]
-        self._lines += loop.lines(stored)
+        rows = self._rows(size) if Sharing.of_step(step) else ("0", str(size))
+        self._lines += loop.lines(stored, *rows)
 
     def _write_gather(self, operation: Operation) -> None:
         (result,) = operation.outputs
@@ -203,13 +263,19 @@ class _FunctionWriter:
     def _write_pack(self, operation: Operation) -> None:
         m, k, transposed = operation.detail
         pointers = ", ".join(map(self._pointer, (*operation.args, *operation.outputs)))
-        self._lines.append(f"  pack({pointers}, {m}, {k}, {f'{k}, 1' if transposed else f'1, {m}'});")
+        strides = f"{k}, 1" if transposed else f"1, {m}"
+        self._lines.append(f"  pack({pointers}, {m}, {k}, {strides}, {self._rows_of(operation)});")
 
     def _write_packed_product(self, operation: Operation) -> None:
         m, k, n, squared = operation.detail
         pointers = ", ".join(map(self._pointer, (*operation.args, *operation.outputs)))
         do = "multiply_packed_lanes" if self._lanes else ("multiply_squares" if squared else "multiply_packed")
-        self._lines.append(f"  {do}({pointers}, {m}, {k}, {n}{', B' if self._lanes else ''});")
+        lanes = ", B" if self._lanes else ""
+        self._lines.append(f"  {do}({pointers}, {m}, {k}, {n}, {self._rows_of(operation)}{lanes});")
+
+    def _rows_of(self, operation: Operation) -> str:
+        m = operation.detail[0]
+        return ", ".join(self._rows(m) if Sharing.of_step([operation]) else ("0", str(m)))
 
     def _write_accumulate(self, operation: Operation) -> None:
         result = operation.outputs[0]
@@ -230,7 +296,7 @@ class _FunctionWriter:
         return [
             f"{indent}{{ const real *const x[] = {{{given}}};",
             f"{indent}  real *const y[] = {{{made}}};",
-            f"{indent}  {name}(x, y, {self._free()}, B); }}",
+            f"{indent}  {name}(x, y, {self._free()}, B{', me' * self._writer.sharing.of_program(program)}); }}",
         ]
 
     def _free(self) -> str:
@@ -250,7 +316,11 @@ class _FunctionWriter:
         for i, case in enumerate(cases):
             blocks = args[inputs + i : inputs + i + 1] if len(args) > inputs else []
             self._lines.append(f"    {'default' if i == len(cases) - 1 else f'case {i}'}:")
+            begin = len(self._lines)
             self._lines += self._call(case, [*args[:inputs], *blocks], results, "      ")
+            if self._calls_shared(operation) and not self._writer.sharing.of_program(case):
+                self._by_first(begin)  # this one alone does not end with a meeting
+                self._lines.append("      meet(me);")
             self._lines.append("      break;")
         self._lines.append("  }")
 
@@ -296,6 +366,7 @@ class _FunctionWriter:
         self._lines += [*lines, *outs, "    } }"]
 
     def _write_outputs(self) -> None:
+        begin = len(self._lines)
         for i, value in enumerate(self._program.outputs):
             constant = constant_of(self._schedule.source(value))
             if constant is None and self._schedule.place(value).base == f"r{i}":
@@ -303,9 +374,19 @@ class _FunctionWriter:
             if value.size:
                 each = self._each(value)
                 self._lines.append(f"  copy(res[{i}], {self._pointer(value)}, {value.size}, 1, {each});")
+        if self._shared:
+            copies = len(self._lines) > begin
+            if copies:
+                self._by_first(begin)
+            if self._meetings.is_due:
+                self._lines.insert(begin, "  meet(me);")
+            if copies:
+                self._lines.append("  meet(me);")
 
 
-_SIGNATURE = "(const real *const *arg, real *const *res, real *w, long B)"
+def signature(shared: bool) -> str:
+    """Return the arguments of a function."""
+    return f"(const real *const *arg, real *const *res, real *w, long B{', struct member *me' * shared})"
 
 
 def _runs(where: Indices, edges: Indices) -> Iterable[tuple[int, int, int, int, int]]:

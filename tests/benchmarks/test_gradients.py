@@ -2,7 +2,8 @@
 
 CPU time, in turns, so that whatever else the machine does hits all alike. All must agree with symgraph, or the times
 would not compare. Calls that compile do not count. "products alone" are the matrix products that no order of the sums
-avoids, by numpy's BLAS: what the machine can do at best. Run by `make bench`, which holds BLAS to one thread.
+avoids, by numpy's BLAS, which is far from the machine's best for few points and small matrices. Run by `make bench`,
+which holds BLAS to one thread.
 """
 
 import os

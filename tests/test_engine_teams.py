@@ -1,0 +1,242 @@
+"""Threads that share each evaluation: to the last bit what one thread finds, none touching what another one writes."""
+
+import shutil
+import subprocess
+
+import casadi as ca
+import numpy as np
+import pytest
+from compiled_functions import bound, code_for, compiled, function_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from symgraph.compile.schedule import Place
+from symgraph.compile.sharing import Access, By, Meetings
+from symgraph.compile.source import kernel_source
+
+N, WIDE, ODD = 5, 41, 37
+SHAPES = [(WIDE, N), (ODD, WIDE), (ODD, ODD), (3, ODD), (4, 1)]
+
+
+def layer(name, m, n):
+    w, x = ca.MX.sym("w", m, n), ca.MX.sym("x", n)
+    return ca.Function(name, [w, x], [ca.tanh(w @ x) + 0.1 * ca.sin(x[0])])
+
+
+FIRST, SECOND, THIRD = layer("first", WIDE, N), layer("second", ODD, WIDE), layer("third", ODD, ODD)
+
+
+def network(u, w, v, a, b):
+    """Layers with means and variances, and scalars between them."""
+    x = FIRST(w, u)
+    y = SECOND(v, x) * ca.exp(-(ca.sin(u[1]) ** 2)) + 0.1 * (v**2) @ x**2
+    z = THIRD(a, y) + THIRD(a, ca.sin(y)[::-1] + x[:ODD])
+    return b @ ca.vertcat(z[3:], z[:2], ca.sumsqr(x) / 40)
+
+
+def straight(u, s, w, v, a, b, p):
+    return ca.sumsqr(network(u, w, v, a, b)) + ca.dot(p, u[:4]) ** 2
+
+
+def mapped(u, s, w, v, a, b, p):
+    return ca.sumsqr(
+        THIRD.map("map", "serial", 3, [0], [])(a, ca.horzcat(*(SECOND(v, FIRST(w, u * i)) for i in (1, 2, 3))))
+    )
+
+
+def switched(u, s, w, v, a, b, p):
+    """One case is shared, the other one is not."""
+    x = ca.MX.sym("x", ODD)
+    cases = [ca.Function("heavy", [a, x], [a @ ca.sin(x)]), ca.Function("light", [a, x], [ca.tanh(x)])]
+    y = ca.Function.conditional("which", cases[:1], cases[1])(s[0], a, SECOND(v, FIRST(w, u)))
+    return ca.sumsqr(y) + ca.sum1(ca.sin(3 * y) * y[::-1])
+
+
+def matrices(u, s, w, v, a, b, p):
+    """Products with several columns, transposed and squared weights."""
+    x = ca.horzcat(*(ca.sin(i * u) for i in range(1, 6)))
+    y = v @ ca.tanh(w @ x)
+    return ca.sumsqr(b @ (a.T @ y + (a**2) @ ca.cos(y)) @ p[0]) + ca.sumsqr(a.T**2 @ y[:, 2])
+
+
+CASES = {"straight": straight, "mapped": mapped, "switched": switched, "matrices": matrices}
+
+
+def numbers():
+    rng = np.random.default_rng(3)
+    return [rng.normal(size=shape) / np.sqrt(shape[1]) for shape in SHAPES]
+
+
+def points_of(count):
+    rng = np.random.default_rng(count)
+    return rng.uniform(-1, 1, (count, N)), rng.integers(0, 2, (count, 1)).astype(float)
+
+
+@pytest.fixture(scope="module", params=["lanes", "narrow", "single"])
+def kernels(request):
+    build = "narrow" if request.param == "narrow" else "lanes"
+    return {
+        name: compiled(function_of(case, N, 1, SHAPES), build, request.param == "single")
+        for name, case in CASES.items()
+    }
+
+
+@pytest.mark.parametrize("threads", [2, 3, 7])
+@pytest.mark.parametrize("name", CASES)
+def test_evaluations_are_those_of_one_thread(kernels, name, threads):
+    alone, together = bound(kernels[name], numbers()), bound(kernels[name], numbers(), threads)
+    for count in (1, 5, 40):
+        for got, wanted in zip(together.evaluate(*points_of(count)), alone.evaluate(*points_of(count)), strict=True):
+            np.testing.assert_array_equal(got, wanted)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_searches_are_those_of_one_thread(kernels, name):
+    ends = [
+        dict(bound(kernels[name], numbers(), threads).climb(*points_of(20), 15, np.full(20, 1e-9)))
+        for threads in (1, 2)
+    ]
+    for p in range(20):
+        np.testing.assert_array_equal(ends[1][p].history, ends[0][p].history)
+        np.testing.assert_array_equal(ends[1][p].point, ends[0][p].point)
+
+
+def test_what_follows_from_the_weights_is_that_of_one_thread(kernels):
+    """It is made by the team that first needs it."""
+    for kernel in kernels.values():
+        together = bound(kernel, [2 * column for column in numbers()], 3).evaluate(*points_of(9))
+        alone = bound(kernel, [2.0 * column for column in numbers()]).evaluate(*points_of(9))
+        for got, wanted in zip(together, alone, strict=True):
+            np.testing.assert_array_equal(got, wanted)
+
+
+MAIN = """
+#include <pthread.h>
+#include <stdlib.h>
+#define THREADS 3
+static struct team team = {THREADS};
+static struct member members[THREADS];
+static const real *shared[N_SHARED + 1];
+static real *block, *early_space, *work;
+static double points[COUNT * N_ACTIONS], chosen[COUNT * N_SELECTIONS];
+static double values[COUNT], gradients[COUNT * N_ACTIONS];
+static double ends[COUNT * N_ACTIONS], tolerances[COUNT], scales[COUNT], histories[COUNT * 10];
+static double low[N_ACTIONS], high[N_ACTIONS];
+static int outcomes[COUNT];
+static long long spent[COUNT];
+static long next;
+static const int stop;
+static struct search search;
+
+static real *some(long count) {
+  real *const x = aligned_alloc(64, (count * sizeof(real) + 64) / 64 * 64);
+  long i;
+  for (i = 0; i < count; ++i) x[i] = (real) (sin((double) (i + count)) / 4);
+  return x;
+}
+static void *thread(void *given) {
+  struct member *const me = given;
+  symgraph_bind(me, shared, block, early_space);
+  symgraph_evaluate(me, COUNT, points, chosen, shared, &stop, values, gradients, work);
+  symgraph_advance(me, &search, shared, work, 20);
+  return 0;
+}
+int main(void) {
+  const long lengths[] = LENGTHS;
+  pthread_t threads[THREADS];
+  long long sizes[5];
+  long i;
+  struct settings set = {low, high, 10, 0, 0, 0, 0, 0, 0, &stop};
+  symgraph_sizes(sizes);
+  block = some(sizes[0]);
+  early_space = some(sizes[1]);
+  work = some(sizes[2]);
+  for (i = 0; i < N_SHARED; ++i) shared[i] = some(lengths[i]);
+  shared[N_SHARED] = block;
+  for (i = 0; i < COUNT * N_ACTIONS; ++i) points[i] = sin((double) i);
+  for (i = COUNT / 2; i < COUNT; ++i) chosen[i] = 1;
+  for (i = 0; i < COUNT; ++i) { tolerances[i] = 1e-9; scales[i] = 1; outcomes[i] = UNDER_WAY; }
+  for (i = 0; i < N_ACTIONS; ++i) { low[i] = -2; high[i] = 2; }
+  symgraph_begin(&search, &set, &next, 1, COUNT, points, chosen, tolerances, scales, ends, values, histories, outcomes,
+                 spent);
+  for (i = 0; i < THREADS; ++i) {
+    members[i].team = &team;
+    members[i].index = i;
+    pthread_create(threads + i, 0, thread, members + i);
+  }
+  for (i = 0; i < THREADS; ++i) pthread_join(threads[i], 0);
+  return !sizes[4] || !isfinite(values[0]);
+}
+"""
+
+
+@pytest.mark.parametrize("lanes", [True, False], ids=["lanes", "narrow"])
+@pytest.mark.parametrize("name", CASES)
+def test_no_two_threads_touch_what_one_of_them_writes(name, lanes, tmp_path):
+    """ThreadSanitizer watches all that generated code reads and writes."""
+    gcc = shutil.which("gcc")
+    if gcc is None or subprocess.run([gcc, "-fsanitize=thread", "-xc", "-", "-o", tmp_path / "probe"],
+                                     input=b"int main(void) { return 0; }", check=False).returncode:  # fmt: skip
+        pytest.skip("no compiler with ThreadSanitizer")
+    source = kernel_source(function_of(CASES[name], N, 1, SHAPES), lanes, single=False)
+    lengths = ", ".join(str(m * n) for m, n in SHAPES)
+    constants = f"#define COUNT 20\n#define LENGTHS {{{lengths}}}\n"
+    (tmp_path / "main.c").write_text(source + constants + MAIN)
+    flags = ["-std=c11", "-O1", "-march=native", "-fsanitize=thread", "-pthread"]
+    subprocess.run([gcc, *flags, "main.c", "-o", "main", "-lm"], cwd=tmp_path, check=True)
+    done = subprocess.run([tmp_path / "main"], capture_output=True, text=True, check=False, timeout=300)
+    if "unexpected memory mapping" in done.stderr:
+        pytest.skip("ThreadSanitizer does not run here")
+    assert done.returncode == 0, done.stderr[:3000]
+
+
+def test_other_processors_share_too():
+    with code_for("any processor"):
+        kernel = compiled(function_of(straight, N, 1, SHAPES))
+    for got, wanted in zip(
+        *(bound(kernel, numbers(), threads).evaluate(*points_of(9)) for threads in (1, 2)), strict=True
+    ):
+        np.testing.assert_array_equal(got, wanted)
+
+
+ACCESSES = st.lists(
+    st.builds(
+        lambda base, begin, size, by, writes: Access(Place(base, begin, wide=True), size, by, writes),
+        st.sampled_from(["w", "r0"]),
+        st.integers(0, 5),
+        st.integers(1, 4),
+        st.sampled_from(By),
+        st.booleans(),
+    ),
+    min_size=1,
+    max_size=4,
+)
+
+
+def touched(access, thread):
+    """What a thread of two may touch: of rows its half, which falls anywhere."""
+    everything = {(access.place.base, access.place.offset + i) for i in range(access.size)}
+    if access.by == By.FIRST:
+        return everything if thread == 0 else set()
+    if access.by == By.ROWS:
+        middle = (access.size + 1) // 2
+        cut = {(access.place.base, access.place.offset + i) for i in range(middle)}
+        return cut if thread == 0 else everything - cut
+    return everything
+
+
+@settings(max_examples=300)
+@given(st.lists(ACCESSES, min_size=2, max_size=6))
+def test_they_meet_before_one_touches_what_the_other_wrote(steps):
+    """Between two meetings nothing that one thread writes is touched by the other in another step."""
+    meetings, since = Meetings(), []
+    for step in steps:
+        if meetings.needed(step):
+            since = []
+        for earlier in since:
+            for one in earlier:
+                for other in step:
+                    if one.writes or other.writes:
+                        assert not touched(one, 0) & touched(other, 1)
+                        assert not touched(one, 1) & touched(other, 0)
+        since.append(step)
