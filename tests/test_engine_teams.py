@@ -1,4 +1,4 @@
-"""Threads that share each evaluation: to the last bit what one thread finds, none touching what another one writes."""
+"""Threads that share each evaluation: to the last bit what one finds, and none touches what another one writes."""
 
 import shutil
 import subprocess
@@ -10,9 +10,11 @@ from compiled_functions import bound, code_for, compiled, function_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from symgraph.compile import sharing
+from symgraph.compile.hoist import Hoister
 from symgraph.compile.schedule import Place
-from symgraph.compile.sharing import Access, By, Meetings
-from symgraph.compile.source import kernel_source
+from symgraph.compile.sharing import PARTS, Access, Costs, Meetings
+from symgraph.compile.source import gradient_program, kernel_source
 
 N, WIDE, ODD = 5, 41, 37
 SHAPES = [(WIDE, N), (ODD, WIDE), (ODD, ODD), (3, ODD), (4, 1)]
@@ -70,6 +72,16 @@ def numbers():
 def points_of(count):
     rng = np.random.default_rng(count)
     return rng.uniform(-1, 1, (count, N)), rng.integers(0, 2, (count, 1)).astype(float)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_however_small(tmp_path_factory):
+    """All programs count as worth sharing; what is compiled that way must not be found by others."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        for name in ("ENOUGH", "GAIN"):
+            patch.setattr(sharing, name, 0)
+        yield
 
 
 @pytest.fixture(scope="module", params=["lanes", "narrow", "single"])
@@ -145,7 +157,7 @@ int main(void) {
   const long lengths[] = LENGTHS;
   pthread_t threads[THREADS];
   long long sizes[5];
-  long i;
+  long i, part;
   struct settings set = {low, high, 10, 0, 0, 0, 0, 0, 0, &stop};
   symgraph_sizes(sizes);
   block = some(sizes[0]);
@@ -162,6 +174,7 @@ int main(void) {
   for (i = 0; i < THREADS; ++i) {
     members[i].team = &team;
     members[i].index = i;
+    for (part = i; part < PARTS; part += THREADS) members[i].parts |= 1u << part;
     pthread_create(threads + i, 0, thread, members + i);
   }
   for (i = 0; i < THREADS; ++i) pthread_join(threads[i], 0);
@@ -180,7 +193,7 @@ def test_no_two_threads_touch_what_one_of_them_writes(name, lanes, tmp_path):
         pytest.skip("no compiler with ThreadSanitizer")
     source = kernel_source(function_of(CASES[name], N, 1, SHAPES), lanes, single=False)
     lengths = ", ".join(str(m * n) for m, n in SHAPES)
-    constants = f"#define COUNT 20\n#define LENGTHS {{{lengths}}}\n"
+    constants = f"#define COUNT 20\n#define LENGTHS {{{lengths}}}\n#define PARTS {PARTS}\n"
     (tmp_path / "main.c").write_text(source + constants + MAIN)
     flags = ["-std=c11", "-O1", "-march=native", "-fsanitize=thread", "-pthread"]
     subprocess.run([gcc, *flags, "main.c", "-o", "main", "-lm"], cwd=tmp_path, check=True)
@@ -201,11 +214,10 @@ def test_other_processors_share_too():
 
 ACCESSES = st.lists(
     st.builds(
-        lambda base, begin, size, by, writes: Access(Place(base, begin, wide=True), size, by, writes),
+        lambda base, begin, size, writes: (Place(base, begin, wide=True), size, writes),
         st.sampled_from(["w", "r0"]),
         st.integers(0, 5),
         st.integers(1, 4),
-        st.sampled_from(By),
         st.booleans(),
     ),
     min_size=1,
@@ -213,30 +225,62 @@ ACCESSES = st.lists(
 )
 
 
-def touched(access, thread):
-    """What a thread of two may touch: of rows its half, which falls anywhere."""
-    everything = {(access.place.base, access.place.offset + i) for i in range(access.size)}
-    if access.by == By.FIRST:
-        return everything if thread == 0 else set()
-    if access.by == By.ROWS:
-        middle = (access.size + 1) // 2
-        cut = {(access.place.base, access.place.offset + i) for i in range(middle)}
-        return cut if thread == 0 else everything - cut
-    return everything
-
-
 @settings(max_examples=300)
-@given(st.lists(ACCESSES, min_size=2, max_size=6))
-def test_they_meet_before_one_touches_what_the_other_wrote(steps):
-    """Between two meetings nothing that one thread writes is touched by the other in another step."""
+@given(st.lists(st.tuples(st.integers(0, PARTS - 1), ACCESSES), min_size=2, max_size=6))
+def test_they_meet_before_one_touches_what_another_one_wrote(steps):
+    """Between two meetings nothing that one part writes is touched by another one."""
+
+    def touched(accesses, written):
+        return {(a.place.base, a.place.offset + i) for a in accesses if a.writes or not written for i in range(a.size)}
+
     meetings, since = Meetings(), []
-    for step in steps:
+    for part, accesses in steps:
+        step = [Access(place, size, part, writes) for place, size, writes in accesses]
         if meetings.needed(step):
             since = []
         for earlier in since:
-            for one in earlier:
-                for other in step:
-                    if one.writes or other.writes:
-                        assert not touched(one, 0) & touched(other, 1)
-                        assert not touched(one, 1) & touched(other, 0)
+            if earlier[0].part != part:
+                assert not touched(earlier, written=True) & touched(step, written=False)
+                assert not touched(earlier, written=False) & touched(step, written=True)
         since.append(step)
+
+
+# Into parts
+
+
+def late(function):
+    return Hoister(lanes=True).halves(gradient_program(function))[1]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_parts_are_in_an_order_that_is_possible(name):
+    program = late(function_of(CASES[name], N, 1, SHAPES))
+    shares = Costs().shares(program)
+    assert set(shares.part) == set(program.operations)
+    place = {operation: i for i, operation in enumerate(shares.part)}
+    for operation in program.operations:
+        assert all(place[arg.maker] < place[operation] for arg in operation.args if arg.maker is not None)
+
+
+def side_by_side(count, size=200):
+    """Networks that have nothing to do with each other but the actions and the sum."""
+
+    def body(u, s, *weights):
+        outputs = []
+        for i in range(count):
+            x = ca.sin(weights[3 * i] @ u)
+            outputs.append(ca.sumsqr(weights[3 * i + 2] @ ca.tanh(weights[3 * i + 1] @ x)))
+        return ca.sum1(ca.vertcat(*outputs))
+
+    return function_of(body, N, 0, [(size, N), (size, size), (4, size)] * count)
+
+
+@pytest.mark.parametrize(("count", "gain"), [(1, 1.0), (2, 2.0), (3, 1.5), (4, 2.0), (8, 2.0)])
+def test_networks_beside_each_other_are_divided_evenly(count, gain):
+    assert Costs().shares(late(side_by_side(count))).gain == pytest.approx(gain, rel=0.1)
+
+
+def test_a_network_and_what_follows_from_it_is_one_threads():
+    """Two networks, two threads: they meet at the beginning and at the end."""
+    source = kernel_source(side_by_side(2), lanes=True, single=False)
+    assert source.split("static void late(")[0].count("  meet(me);") <= 12  # of both halves

@@ -1,4 +1,4 @@
-"""Threads that share evaluations, each its rows, or points, each its own."""
+"""Threads that share evaluations, or points."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
 from typing import Any
+
+from symgraph.compile.sharing import PARTS
 
 MOST_THREADS = 10_000
 
@@ -29,17 +31,21 @@ class _Member(ctypes.Structure):
     _fields_ = (
         ("team", ctypes.c_void_p),
         ("index", ctypes.c_long),
+        ("parts", ctypes.c_uint),
         ("meetings", ctypes.c_long),
         ("apart", ctypes.c_char * 64),
     )
 
 
 class Crew:
-    """Threads, in teams whose members do the same work together."""
+    """Threads, in teams whose members do the same work together; of more members than parts some only wait."""
 
     def __init__(self, teams: int, members: int) -> None:
         self._teams = [_Team(threads=members) for _ in range(teams)]
-        self._members = [[_Member(ctypes.addressof(team), i) for i in range(members)] for team in self._teams]
+        parts = [sum(1 << part for part in range(i, PARTS, members)) for i in range(members)]
+        self._members = [
+            [_Member(ctypes.addressof(team), i, mine) for i, mine in enumerate(parts)] for team in self._teams
+        ]
 
     def work(self, task: Callable[..., None], arguments: Sequence[tuple[Any, ...]]) -> None:
         """Call task(member, …) with other arguments for each team, side by side; return when all are done."""
@@ -48,8 +54,9 @@ class Crew:
             for members, given in zip(self._members, arguments, strict=False)
             for member in members
         ]
-        if len(calls) == 1:
-            task(*calls[0])
+        if len(calls) <= 1:
+            for call in calls:
+                task(*call)
             return
         futures: list[Future[None]] = []
         interrupt: KeyboardInterrupt | None = None
@@ -77,5 +84,3 @@ def _pool(process: int) -> ThreadPoolExecutor:
     """Return the threads of a process; a forked one has none of its parent's."""
     # As many as are asked for: members of a team wait for each other, so each must have a thread.
     return ThreadPoolExecutor(MOST_THREADS, thread_name_prefix=f"symgraph-{process}")
-
-

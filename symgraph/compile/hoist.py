@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 
 from symgraph.compile.differentiate import called, copied, recalled
+from symgraph.compile.pairing import Group, in_pairs, weights_of
 from symgraph.compile.program import CALLS, Indices, Kind, Operation, Program, Value, constant_of
 
 PANEL = 8  # rows of a packed matrix that stand together, see products.c
@@ -46,9 +47,12 @@ class Hoister:
         # In the reverse sweep one division serves all with the same divisor; values stay what CasADi makes of them.
         divisions = [o for o in operations if o.code == ca.OP_DIV and o.reverse and o.outputs[0].kind > Kind.BOUND]
         divisors = Counter(o.args[1] for o in divisions)
-        for operation in operations:
+        for group in [(operation,) for operation in operations] if self._lanes else in_pairs(operations):
+            operation = group[0]
             whole.reversing = operation.reverse
-            if operation.reverse and operation.code == ca.OP_DIV and divisors[operation.args[1]] > 1:
+            if len(group) > 1:
+                self._rewrite_pair(whole, group, new)
+            elif operation.reverse and operation.code == ca.OP_DIV and divisors[operation.args[1]] > 1:
                 x, y = (new[arg] for arg in operation.args)
                 inverse = whole.elementwise(ca.OP_INV, y)
                 new[operation.outputs[0]] = whole.elementwise(ca.OP_MUL, x, inverse)
@@ -91,20 +95,31 @@ class Hoister:
         elif operation.code == "product" and new[operation.args[0]].kind == Kind.BOUND:
             left, right = (new[arg] for arg in operation.args)
             m, k, n = operation.detail
-            maker = left.maker
             # A point alone is bound by how fast weights can be read: squares are better made anew.
-            square = maker.args[0] if maker is not None and maker.code == ca.OP_SQ else None
-            squared = square is not None and not self._lanes
-            plain = left if square is None else square
-            transposed = plain.maker is not None and plain.maker.code == "transpose"
-            plain = plain.maker.args[0] if transposed and plain.maker is not None else plain
-            left = plain if square is None or squared else whole.elementwise(ca.OP_SQ, plain)
-            shape = m, k, transposed
-            (packed,) = whole.add("pack", (left,), shape, [-(-m // PANEL) * PANEL * k], shape)
+            packed, squared = self._packed(whole, left, m, k, keep_squares=self._lanes)
             detail = m, k, n, squared
             new[operation.outputs[0]] = whole.add("packed product", (packed, right), detail, [m * n], detail)[0]
         else:
             copied(whole, operation, new)
+
+    def _rewrite_pair(self, whole: Program, pair: Group, new: dict[Value, Value]) -> None:
+        """Two products with the same weights, in the second one with their squares, become one operation."""
+        plain, squared = pair
+        m, k, _ = plain.detail
+        packed, _ = self._packed(whole, new[plain.args[0]], m, k, keep_squares=False)
+        given = packed, new[plain.args[1]], new[squared.args[1]]
+        made = whole.add("packed pair", given, (m, k), [m, m], (m, k))
+        new.update(zip((plain.outputs[0], squared.outputs[0]), made, strict=True))
+
+    @staticmethod
+    def _packed(whole: Program, left: Value, m: int, k: int, keep_squares: bool) -> tuple[Value, bool]:
+        """Return a packed matrix (m, k), and whether it is still to be squared."""
+        matrix, transposed, squared = weights_of(left)
+        if squared and keep_squares:
+            matrix = whole.elementwise(ca.OP_SQ, matrix)
+        shape = m, k, transposed
+        (packed,) = whole.add("pack", (matrix,), shape, [-(-m // PANEL) * PANEL * k], shape)
+        return packed, squared and not keep_squares
 
     def _rewrite_call(self, whole: Program, operation: Operation, new: dict[Value, Value]) -> None:
         """A call of a program becomes one of its first half, which is bound, and one of its second half."""

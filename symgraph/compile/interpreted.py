@@ -20,6 +20,8 @@ SMALLEST_GAIN = 1e-15
 MOST_PAIRS = 8
 CURVATURE = 0.9
 LOOSE = 1e3
+HIDDEN = 1e-12
+DECREASE = 0.1
 MOST_ROUNDS = 10
 MOST_TRIES = 50
 
@@ -130,11 +132,15 @@ class _BoundInterpreted(BoundKernel):
                 iterations, outcome = len(history), "time limit"
             if fresh:
                 free = ~((span <= 0.0) | ((u <= 0.0) & (g > 0.0)) | ((u >= 1.0) & (g < 0.0)))
-                slope = float(np.abs(g * free).max(initial=0.0))
+                before, slope = slope, float(np.abs(g * free).max(initial=0.0))
                 if slope <= tolerance:
                     outcome = "converged"
                     break
+                flat = 0 if slope < before / 2.0 else flat  # a gain that values are too coarse for
                 d = _direction(pairs, u, g, free.astype(float))
+                if pairs and 0.0 < -(d @ g) <= noise and slope <= LOOSE * tolerance:
+                    outcome = "converged"  # rounding would hide what is left to gain
+                    break
                 if not pairs or not d @ g < 0.0:  # nothing known of the curvature: along the gradient
                     d = -g * free * (FIRST_STEP / slope)
                 descent, longest = float(d @ g), float(np.abs(d).max())
@@ -148,9 +154,11 @@ class _BoundInterpreted(BoundKernel):
                 f_trial, g_trial, finite = descend(trial)
                 slope_trial = float(g_trial @ (d * ((trial > 0.0) & (trial < 1.0))))
                 tries += 1
-                if (
-                    finite and predicted < 0.0 and f_trial <= f + ARMIJO * predicted + noise
-                ):  # the best so far, if not yet a good one
+                gained = f_trial <= f + ARMIJO * predicted + noise or (
+                    f_trial <= f + HIDDEN * abs(f)
+                    and CURVATURE * descent <= slope_trial <= (2.0 * DECREASE - 1.0) * descent
+                )
+                if finite and predicted < 0.0 and gained:  # the best so far, if not yet a good one
                     t_low, f_low, u_low, g_low = t, f_trial, trial, g_trial
                     accepted = slope_trial >= CURVATURE * descent or f - f_trial <= noise or tries > MOST_TRIES
                     accepted = accepted or (t_high == np.inf and t * longest >= LONGEST_STEP)
@@ -162,7 +170,7 @@ class _BoundInterpreted(BoundKernel):
                     else:  # the minimum of the parabola through f, its slope and the new value, within bounds
                         rise = f_trial - f - predicted
                         shrink = -predicted / (2.0 * rise) if finite and rise > 0.0 else 0.1
-                        t *= min(max(shrink, 0.1), 0.5)
+                        t *= min(max(shrink, 1e-3 if doubted else 0.1), 0.5)
                     if tries > MOST_TRIES or np.abs(trial - u).max() <= 1e-16:
                         accepted = t_low > 0.0
                         if not accepted:  # no step gains; if the pairs are to blame, the gradient alone still will

@@ -79,8 +79,8 @@ class Loop:
         self._body.append(f"const {kind} {name} = {text};")
         return name
 
-    def lines(self, stored: Sequence[Value], begin: str, end: str) -> list[str]:
-        """Return the loop over rows from `begin` to `end`, which ends by storing values."""
+    def lines(self, stored: Sequence[Value]) -> list[str]:
+        """Return the loop, which ends by storing values."""
         for value in stored:
             pointer, name = self._pointer(value), self._names[value]
             if not self._vector:
@@ -92,11 +92,11 @@ class Loop:
         if not self._vector:
             head = ["  {"]
         elif not self._lanes:
-            head = [f"  {{ long i; const long end = {end}; for (i = {begin}; i < end; i += VL) {{"]
+            head = [f"  {{ long i; for (i = 0; i < {self._size}; i += VL) {{"]
         elif self._plain:
-            head = [f"  {{ long i; const long end = {end} * B; for (i = {begin} * B; i < end; i += VL) {{"]
+            head = [f"  {{ long i; for (i = 0; i < {self._size} * B; i += VL) {{"]
         else:
-            loops = f"for (e = {begin}; e < end; ++e) for (l = 0; l < B; l += VL) {{"
-            head = [f"  {{ long e, l; const long end = {end}; {loops}", "    const long i = e * B + l;"]
+            loops = f"for (e = 0; e < {self._size}; ++e) for (l = 0; l < B; l += VL) {{"
+            head = [f"  {{ long e, l; {loops}", "    const long i = e * B + l;"]
         tail = ["  } }"] if self._vector else ["  }"]
         return [*head, *(f"    {line}" for line in self._body), *tail]

@@ -12,12 +12,10 @@
 
 typedef real row_vec __attribute__((vector_size(PANEL * sizeof(real)), aligned(sizeof(real)), may_alias));
 
-/* All that is packed is done for the rows `from` to `to`, which are whole panels but at the end of a matrix. */
-
 /* z (panels of PANEL rows) = the matrix (m, k) whose numbers lie `row` and `column` apart; rows beyond m are zero. */
-static void pack(const real *x, real *z, long m, long k, long row, long column, long from, long to) {
+static void pack(const real *x, real *z, long m, long k, long row, long column) {
   long i, p, r;
-  for (i = from, x += from * row, z += from * k; i < to; i += PANEL, x += PANEL * row)
+  for (i = 0; i < m; i += PANEL, x += PANEL * row)
     if (m - i >= PANEL)
       for (p = 0; p < k; ++p, z += PANEL)
         for (r = 0; r < PANEL; ++r) z[r] = x[r * row + p * column];
@@ -80,12 +78,12 @@ static void tile_1(const real *w, long k, const real *x0, real *z0, long rows, l
 #define VECTOR(p, rows, v) ((p) + (v) / per_column * (rows) * B + (v) % per_column * VL)
 
 /* z (m, n) = w (m, k) x (k, n), w packed, x and z with B lanes. */
-static void multiply_packed_lanes(const real *w, const real *x, real *z, long m, long k, long n, long from, long to, long B) {
+static void multiply_packed_lanes(const real *w, const real *x, real *z, long m, long k, long n, long B) {
   const long per_column = B / VL, vectors = n * per_column;
   long i, r, v;
-  for (i = from, w += from * k; i < to; i += PANEL, w += PANEL * k)
-    for (r = 0; r < PANEL && i + r < to; r += TILE_ROWS) {
-      const long rows = to - i - r < TILE_ROWS ? to - i - r : TILE_ROWS;
+  for (i = 0; i < m; i += PANEL, w += PANEL * k)
+    for (r = 0; r < PANEL && i + r < m; r += TILE_ROWS) {
+      const long rows = m - i - r < TILE_ROWS ? m - i - r : TILE_ROWS;
       real *const y = z + (i + r) * B;
       for (v = 0; v < vectors;) {
         const long left = vectors - v;
@@ -114,11 +112,11 @@ static inline void put_rows(real *z, row_vec x, long rows) {
 /* z (m, n) = w (m, k) x (k, n), w packed, or with the squares of w; bound by how fast w can be read, so four panels at once,
    or one for four columns. Unlike above, squares are better made anew than read. */
 #define MULTIPLY_PACKED(name, NUMBER) \
-  static void name(const real *w, const real *x, real *z, long m, long k, long n, long from, long to) { \
+  static void name(const real *w, const real *x, real *z, long m, long k, long n) { \
     long i, j, p; \
     for (j = 0; j + 4 <= n; j += 4, x += 4 * k, z += 4 * m) { \
-      const real *panel = w + from * k, *const x1 = x + k, *const x2 = x + 2 * k, *const x3 = x + 3 * k; \
-      for (i = from; i < to; i += PANEL) { \
+      const real *panel = w, *const x1 = x + k, *const x2 = x + 2 * k, *const x3 = x + 3 * k; \
+      for (i = 0; i < m; i += PANEL) { \
         row_vec a = {0}, b = {0}, c = {0}, d = {0}; \
         for (p = 0; p < k; ++p, panel += PANEL) { \
           const row_vec row = NUMBER(panel); \
@@ -127,16 +125,16 @@ static inline void put_rows(real *z, row_vec x, long rows) {
           c += row * x2[p]; \
           d += row * x3[p]; \
         } \
-        put_rows(z + i, a, to - i); \
-        put_rows(z + m + i, b, to - i); \
-        put_rows(z + 2 * m + i, c, to - i); \
-        put_rows(z + 3 * m + i, d, to - i); \
+        put_rows(z + i, a, m - i); \
+        put_rows(z + m + i, b, m - i); \
+        put_rows(z + 2 * m + i, c, m - i); \
+        put_rows(z + 3 * m + i, d, m - i); \
       } \
     } \
     for (; j < n; ++j, x += k, z += m) { \
-      const real *panel = w + from * k; \
+      const real *panel = w; \
       const long size = PANEL * k; \
-      for (i = from; i + 3 * PANEL < to; i += 4 * PANEL, panel += 4 * size) { \
+      for (i = 0; i + 3 * PANEL < m; i += 4 * PANEL, panel += 4 * size) { \
         row_vec a = {0}, b = {0}, c = {0}, d = {0}; \
         const real *row = panel; \
         for (p = 0; p < k; ++p, row += PANEL) { \
@@ -145,15 +143,15 @@ static inline void put_rows(real *z, row_vec x, long rows) {
           c += NUMBER(row + 2 * size) * x[p]; \
           d += NUMBER(row + 3 * size) * x[p]; \
         } \
-        put_rows(z + i, a, to - i); \
-        put_rows(z + i + PANEL, b, to - i - PANEL); \
-        put_rows(z + i + 2 * PANEL, c, to - i - 2 * PANEL); \
-        put_rows(z + i + 3 * PANEL, d, to - i - 3 * PANEL); \
+        put_rows(z + i, a, m - i); \
+        put_rows(z + i + PANEL, b, m - i - PANEL); \
+        put_rows(z + i + 2 * PANEL, c, m - i - 2 * PANEL); \
+        put_rows(z + i + 3 * PANEL, d, m - i - 3 * PANEL); \
       } \
-      for (; i < to; i += PANEL, panel += size) { \
+      for (; i < m; i += PANEL, panel += size) { \
         row_vec a = {0}; \
         for (p = 0; p < k; ++p) a += NUMBER(panel + p * PANEL) * x[p]; \
-        put_rows(z + i, a, to - i); \
+        put_rows(z + i, a, m - i); \
       } \
     } \
   }
@@ -161,6 +159,33 @@ static inline void put_rows(real *z, row_vec x, long rows) {
 #define SQUARED_ROW(p) (ROW(p) * ROW(p))
 MULTIPLY_PACKED(multiply_packed, ROW)
 MULTIPLY_PACKED(multiply_squares, SQUARED_ROW)
+
+/* z = w x, and y = the squares of w times v, w (m, k) packed, each of one column; two panels at once. */
+static void multiply_pair(const real *w, const real *x, const real *v, real *z, real *y, long m, long k) {
+  const long size = PANEL * k;
+  long i, p;
+  for (i = 0; i < m; i += 2 * PANEL, w += 2 * size) {
+    row_vec a = {0}, b = {0}, c = {0}, d = {0};
+    const real *row = w;
+    if (i + PANEL < m) {
+      for (p = 0; p < k; ++p, row += PANEL) {
+        a += ROW(row) * x[p];
+        b += SQUARED_ROW(row) * v[p];
+        c += ROW(row + size) * x[p];
+        d += SQUARED_ROW(row + size) * v[p];
+      }
+      put_rows(z + i + PANEL, c, m - i - PANEL);
+      put_rows(y + i + PANEL, d, m - i - PANEL);
+    } else {
+      for (p = 0; p < k; ++p, row += PANEL) {
+        a += ROW(row) * x[p];
+        b += SQUARED_ROW(row) * v[p];
+      }
+    }
+    put_rows(z + i, a, m - i);
+    put_rows(y + i, b, m - i);
+  }
+}
 
 /* z (m, n) = x (m, k) y (k, n). */
 static void multiply(const real *x, const real *y, real *z, long m, long k, long n) {

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 
@@ -12,7 +14,10 @@ from symgraph.compile.program import Kind, Operation, Program, Value, constant_o
 
 LONGEST = {True: 256, False: 96}  # elementwise operations of one loop: on single numbers, on arrays
 
+_MOVES = ("gather", "accumulate", "spread")  # operations that cost little
+
 Step = list[Operation]  # one operation, or elementwise ones on arrays of the same size
+Loop = tuple[int, int | None]  # that size, and the part of a shared program that they belong to
 
 
 @dataclass(frozen=True)
@@ -27,16 +32,24 @@ class Place:
 class Schedule:
     """Steps of a program, and where its values are.
 
+    Args:
+        program: what to carry out.
+        lanes: whether values have a number for each of several points.
+        parts: the program's operations in another order, if threads share it, and which part each is of.
+
     Attributes:
         steps: in order.
         work: numbers of workspace, each for all lanes if there are lanes.
     """
 
-    def __init__(self, program: Program, lanes: bool) -> None:
+    def __init__(self, program: Program, lanes: bool, parts: Mapping[Operation, int | None] | None = None) -> None:
         self._program = program
         self._lanes = lanes
+        self._operations = list(program.operations if parts is None else parts)
+        self._parts = dict.fromkeys(self._operations, 0) if parts is None else parts
+        self._divided = parts is not None
         self._aliases: dict[Value, tuple[Value, int]] = {}  # value → the one that it is a part of, and from where on
-        for operation in program.operations:
+        for operation in self._operations:
             if operation.code == "held" or is_view(operation):
                 offset = 0 if operation.code == "held" else int(operation.detail[0])
                 self._aliases[operation.outputs[0]] = operation.args[0], offset
@@ -82,41 +95,44 @@ class Schedule:
 
     def _make_steps(self) -> Iterator[Step]:
         """Put elementwise operations on equally long arrays together, as long as nothing in between needs them."""
-        open_steps: dict[int, Step] = {}
-        owner: dict[Operation, int] = {}
+        open_steps: dict[Loop, Step] = {}
+        owner: dict[Operation, Loop] = {}
 
-        def close(size: int) -> Step:
-            step = open_steps.pop(size)
+        def close(loop: Loop) -> Step:
+            step = open_steps.pop(loop)
             for operation in step:
                 owner.pop(operation, None)
             return step
 
-        for operation in self._program.operations:
+        for operation in self._operations:
             if operation.code == "constant" or operation.outputs[0] in self._aliases:
                 continue
-            size = operation.outputs[0].size if operation.is_elementwise else -1
-            needed: dict[int, None] = {}
+            size = operation.outputs[0].size
+            here = (size, self._parts[operation]) if operation.is_elementwise else None
+            needed: dict[Loop, None] = {}
             for arg in operation.args:
                 maker = self._made_by(arg)
                 # One number of an array is complete only after the loop that makes the array.
-                if maker is not None and maker in owner and not (owner[maker] == size == arg.size):
+                if maker is not None and maker in owner and not (owner[maker] == here and size == arg.size):
                     needed[owner[maker]] = None
+            if self._divided and operation.code not in _MOVES and here is None:
+                needed = dict.fromkeys(open_steps)  # what others need of these must not wait for this operation
             for other in needed:
                 yield close(other)
-            if size < 0:
+            if here is None:
                 yield [operation]
                 continue
-            open_steps.setdefault(size, []).append(operation)
-            owner[operation] = size
-            if len(open_steps[size]) >= LONGEST[size == 1]:
-                yield close(size)
-        for size in list(open_steps):
-            yield close(size)
+            open_steps.setdefault(here, []).append(operation)
+            owner[operation] = here
+            if len(open_steps[here]) >= LONGEST[size == 1]:
+                yield close(here)
+        for loop in list(open_steps):
+            yield close(loop)
 
     def _join(self) -> None:
         """Let values that are put one after the other be written there in the first place."""
         made = {output: operation for step in self.steps for operation in step for output in operation.outputs}
-        for operation in self._program.operations:
+        for operation in self._operations:
             whole = operation.outputs[0]
             if operation.code != "gather" or not is_concatenation(operation) or whole not in made:
                 continue
@@ -132,6 +148,7 @@ class Schedule:
         first: dict[Value, int] = {}
         last: dict[Value, int] = {}
         readers: dict[Value, set[int]] = {}
+        lent: set[Value] = set()  # to other parts: where it is kept its own part cannot write without waiting for them
         for s, step in enumerate(self.steps):
             for operation in step:
                 for value in (*operation.args, *operation.outputs):
@@ -139,8 +156,11 @@ class Schedule:
                     first.setdefault(root, s)
                     last[root] = s
                 for arg in operation.args:
+                    root = self._root(arg)[0]
                     readers.setdefault(arg, set()).add(s)
-                    readers.setdefault(self._root(arg)[0], set()).add(s)
+                    readers.setdefault(root, set()).add(s)
+                    if self._parts[operation] not in (None, self._part_of(root)):
+                        lent.add(root)
         end = len(self.steps)
         for value in self._program.outputs:
             root = self._root(value)[0]
@@ -163,13 +183,22 @@ class Schedule:
             if root not in self._bases and constant_of(root) is None and root.maker is not None:
                 begins.setdefault(s, []).append(root)
                 ends.setdefault(last[root], []).append(root)
-        memory = _Memory()
+        # Each part has memory of its own: it need not wait for others to write to it.
+        memories: dict[int, _Memory] = defaultdict(_Memory)
+        offsets: dict[Value, int] = {}
         for s in range(end):
             for root in begins.get(s, []):
-                self._bases[root] = "w", memory.take(root.size)
+                offsets[root] = memories[self._part_of(root)].take(root.size)
             for root in ends.get(s, []):
-                memory.give(self._bases[root][1], root.size)
-        return memory.size
+                if root not in lent:
+                    memories[self._part_of(root)].give(offsets[root], root.size)
+        begin = dict(zip(memories, accumulate((memory.size for memory in memories.values()), initial=0), strict=False))
+        for root, offset in offsets.items():
+            self._bases[root] = "w", begin[self._part_of(root)] + offset
+        return sum(memory.size for memory in memories.values())
+
+    def _part_of(self, root: Value) -> int:
+        return (self._parts[root.maker] if root.maker is not None else None) or 0
 
 
 class _Memory:

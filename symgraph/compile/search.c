@@ -26,6 +26,8 @@ static const double LONGEST_STEP = 0.5;    /* [range] no step crosses more than 
 static const double ARMIJO = 1e-4;         /* sufficient decrease: Nocedal & Wright 2006, equation 3.4 */
 static const double CURVATURE = 0.9;       /* how much flatter a step must end: equation 3.6b there */
 static const double LOOSE = 1e3;           /* times the tolerance: converged where rounding hides all further gain */
+static const double HIDDEN = 1e-12;        /* relative to the value: differences in which rounding may outweigh what is gained */
+static const double DECREASE = 0.1;        /* there slopes decide: Hager & Zhang 2005, equation 4.1 */
 static const int MOST_ROUNDS = 10;         /* of sending actions to their bounds */
 static const int MOST_TRIES = 50;          /* steps of one line search */
 #ifdef SINGLE
@@ -193,6 +195,7 @@ static int climb_on(struct walk *k, const struct settings *set) {
   }
   if (k->fresh) {
     double *const mask = k->scratch[0], *const free = k->scratch[1], *const to_bound = k->scratch[2];
+    const double before = k->slope;
     k->slope = 0;
     for (i = 0; i < N_ACTIONS; ++i) {
       int held = high[i] <= low[i] || (k->u[i] <= 0 && k->g[i] > 0) || (k->u[i] >= 1 && k->g[i] < 0);
@@ -203,7 +206,12 @@ static int climb_on(struct walk *k, const struct settings *set) {
       k->outcome = CONVERGED;
       return 0;
     }
+    if (k->slope < before / 2) k->flat = 0; /* a gain that values are too coarse for */
     k->descent = direction(&k->pairs, k->u, k->g, mask, k->d, to_bound);
+    if (k->pairs.stored && k->descent < 0 && -k->descent <= SMALLEST_GAIN * fabs(k->f) && k->slope <= LOOSE * k->tolerance) {
+      k->outcome = CONVERGED; /* rounding would hide what is left to gain */
+      return 0;
+    }
     if (k->pairs.stored == 0 || !(k->descent < 0)) { /* nothing known of the curvature: along the gradient */
       k->descent = 0;
       for (i = 0; i < N_ACTIONS; ++i) {
@@ -252,9 +260,12 @@ static int climb(struct walk *k, const struct settings *set, double value, doubl
     return finite && climb_on(k, set);
   }
   noise = SMALLEST_GAIN * fabs(k->f);
-  gained = finite && k->predicted < 0 && f_trial <= k->f + ARMIJO * k->predicted + noise;
   for (i = 0; i < N_ACTIONS; ++i)
     if (k->trial[i] > 0 && k->trial[i] < 1) slope_trial += g_trial[i] * k->d[i];
+  gained = finite && k->predicted < 0 &&
+           (f_trial <= k->f + ARMIJO * k->predicted + noise ||
+            (f_trial <= k->f + HIDDEN * fabs(k->f) && slope_trial >= CURVATURE * k->descent &&
+             slope_trial <= (2 * DECREASE - 1) * k->descent));
   ++k->tries;
   if (gained) { /* the best step so far, if not yet a good one */
     k->t_low = k->t;
@@ -272,10 +283,11 @@ static int climb(struct walk *k, const struct settings *set, double value, doubl
     k->t_high = k->t;
     if (k->t_low > 0) {
       k->t = (k->t_low + k->t_high) / 2;
-    } else { /* the minimum of the parabola through f, its slope and the new value, within a tenth to a half */
+    } else { /* the minimum of the parabola through f, its slope and the new value, within a tenth
+         (less where nothing is known of how long steps should be) to a half */
       double rise = f_trial - k->f - k->predicted;
       double shrink = finite && rise > 0 ? -k->predicted / (2 * rise) : 0.1;
-      k->t *= smaller(larger(shrink, 0.1), 0.5);
+      k->t *= smaller(larger(shrink, k->doubted ? 1e-3 : 0.1), 0.5);
     }
     if (k->tries > MOST_TRIES || moved <= 1e-16) {
       accepted = k->t_low > 0;

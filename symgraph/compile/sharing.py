@@ -1,32 +1,36 @@
-"""Which steps of a program several threads share, and where they must wait for each other."""
+"""How the threads of a team share a program: what does not depend on each other is done at the same time.
+
+A network's mean and its error, and the networks of several branches, go through their layers side by side. Operations
+are put in levels, each behind as many costly ones as depend on each other; those of a level that meet in the next one
+belong together. Each such group is done by one thread, by that which made what it needs where loads allow it.
+"""
 
 from __future__ import annotations
 
-from enum import Enum
+from collections import defaultdict
+from collections.abc import Iterator
 from typing import NamedTuple
 
 from symgraph.compile.differentiate import called
-from symgraph.compile.program import CALLS, Program
-from symgraph.compile.schedule import Place, Step
+from symgraph.compile.program import CALLS, Kind, Operation, Program
+from symgraph.compile.schedule import Place, is_view
 
-MANY_WEIGHTS = 1024  # of a matrix from which on a product is shared
-MANY_ROWS = 32  # of arrays from which on elementwise operations are
+PARTS = 4  # into which a program is divided; each thread of a team does some of them
+COSTLY = 400  # numbers that an operation multiplies or moves, from which on it may stand for itself
+ENOUGH = 300_000  # that a program costs, from which on threads that wait for each other still gain
+ALONE = 0.7  # of a level's cost, from which on a call is shared instead of made beside others
+SURE = 0.95  # of how uneven loads are: less than that makes up for other threads having made what is needed
+GAIN = 1.5  # of two threads, from which on they share evaluations rather than points
 
-
-class By(Enum):
-    """Who touches an array."""
-
-    FIRST = 0  # one thread alone
-    ROWS = 1  # each thread its own rows
-    ALL = 2  # each thread all of it
+_COSTLY = (*CALLS, "product", "packed product", "packed pair", "pack", "transpose", "external")
 
 
 class Access(NamedTuple):
-    """A step reads an array or writes it."""
+    """A part reads an array or writes it."""
 
     place: Place
     size: int
-    by: By
+    part: int
     writes: bool
 
 
@@ -45,54 +49,176 @@ class Meetings:
         self._since = {}
 
     def needed(self, accesses: list[Access]) -> bool:
-        """Whether threads must meet before a step, since some thread touches what another one does; note the step."""
-        conflict = any(
-            _conflict(before, access) for access in accesses for before in self._since.get(access.place.base, [])
-        )
-        if conflict:
+        """Whether threads must meet before a step, since two parts touch what one of them writes; note the step."""
+        due = self.conflict(accesses)
+        if due:
             self.hold()
         for access in accesses:
             self._since.setdefault(access.place.base, []).append(access)
-        return conflict
+        return due
+
+    def conflict(self, accesses: list[Access]) -> bool:
+        """Whether another part has touched what is written now, or written what is touched."""
+        return any(
+            _conflict(before, access) for access in accesses for before in self._since.get(access.place.base, [])
+        )
 
 
 def _conflict(one: Access, other: Access) -> bool:
-    if not (one.writes or other.writes):
+    if one.part == other.part or not (one.writes or other.writes):
         return False
-    begin, end = (one.place.offset, other.place.offset), (one.place.offset + one.size, other.place.offset + other.size)
-    if max(begin) >= min(end):
-        return False
-    if one.by != other.by or one.by == By.ALL:
-        return True
-    return one.by == By.ROWS and (begin[0], end[0]) != (begin[1], end[1])
+    begin, end = (
+        max(one.place.offset, other.place.offset),
+        min(one.place.offset + one.size, other.place.offset + other.size),
+    )
+    return begin < end
 
 
-class Sharing:
-    """Says of programs and their steps whether several threads share them."""
+Share = tuple[float, list[Operation], int]  # what a group of operations costs, the group, the part it is of
+
+
+class Shares:
+    """A program in parts.
+
+    Attributes:
+        operations: in an order that is possible, level by level.
+        part: of each operation, in that order; None for a call that all threads make, and share what is called.
+    """
+
+    def __init__(self, program: Program, costs: Costs) -> None:
+        self._costs = costs
+        levels: dict[Operation, int] = {}
+        for operation in program.operations:
+            makers = [arg.maker for arg in operation.args if arg.maker is not None]
+            levels[operation] = max((levels[maker] + costs.is_costly(maker) for maker in makers), default=0)
+        place = {operation: i for i, operation in enumerate(program.operations)}
+        # What costs little comes first, or it would wait for costly operations of its level that it does not need.
+        self.operations = sorted(
+            program.operations, key=lambda operation: (levels[operation], costs.is_costly(operation), place[operation])
+        )
+        self.part: dict[Operation, int | None] = {}
+        self._time = 0.0
+        for groups in self._by_level(levels):
+            self._divide(groups)
+        self.part = {operation: self.part[operation] for operation in self.operations}
+
+    @property
+    def gain(self) -> float:
+        """How much less time two threads take, were it not for meetings."""
+        return sum(self._costs.of(operation) for operation in self.operations) / max(self._time, 1.0)
+
+    def _by_level(self, levels: dict[Operation, int]) -> Iterator[list[list[Operation]]]:
+        """Yield costly operations of a level, and all up to the next ones, in groups of those that meet."""
+        root: dict[Operation, Operation] = {}
+
+        def find(operation: Operation) -> Operation:
+            while root[operation] is not operation:
+                root[operation] = root[root[operation]]
+                operation = root[operation]
+            return operation
+
+        stage = {o: levels[o] + self._costs.is_costly(o) for o in self.operations}
+        for operation in self.operations:
+            root[operation] = operation
+            if self._costs.is_costly(operation) or operation.code == "gather":  # which only moves what is made
+                continue
+            for maker in (arg.maker for arg in operation.args):
+                if maker is not None and stage[maker] == stage[operation] and maker.code not in CALLS:
+                    root[find(maker)] = find(operation)
+        stages: dict[int, dict[Operation, list[Operation]]] = defaultdict(lambda: defaultdict(list))
+        for operation in self.operations:
+            stages[stage[operation]][find(operation)].append(operation)
+        for _, groups in sorted(stages.items()):
+            yield list(groups.values())
+
+    def _divide(self, groups: list[list[Operation]]) -> None:
+        """Give each group of a level to the part that made what it needs, or where loads differ to another one."""
+        together = 0.0
+        chosen: list[Share] = []
+        costs = [sum(map(self._costs.of, group)) for group in groups]
+        callees = [called(group[0]) if self._costs.is_shared(group[0]) else () for group in groups]
+        for cost, group, programs in zip(costs, groups, callees, strict=True):
+            # Calls of one function, one after the other, find its weights near at hand.
+            alike = sum(other for other, others in zip(costs, callees, strict=True) if others == programs)
+            if programs and alike > ALONE * sum(costs):
+                self.part |= dict.fromkeys(group)
+                together += cost / min(self._costs.shares(program).gain for program in programs)
+            else:
+                chosen.append((cost, group, self._nearest(group)))
+        chosen = _balanced(chosen)
+        for _, group, part in chosen:
+            self.part |= dict.fromkeys(group, part)
+        self._time += together + max(_loads(chosen, 2))
+
+    def _nearest(self, group: list[Operation]) -> int:
+        """Return the part that made most of what a group needs."""
+        made = [0] * PARTS
+        for operation in group:
+            for arg in operation.args:
+                part = self.part.get(arg.maker) if arg.maker is not None else None
+                if part is not None and arg.kind > Kind.BOUND:
+                    made[part] += arg.size
+        return max(range(PARTS), key=lambda part: (made[part], -part))
+
+
+def _balanced(chosen: list[Share]) -> list[Share]:
+    """Move groups to other parts as long as loads become more even, for two threads and for one for each part."""
+
+    def uneven(some: list[Share]) -> float:
+        return sum(load**2 for threads in (2, PARTS) for load in _loads(some, threads))
+
+    best = uneven(chosen)
+    movable = [i for i, (cost, _, _) in enumerate(chosen) if cost >= COSTLY]
+    while True:
+        moves = [[*chosen[:i], (*chosen[i][:2], part), *chosen[i + 1 :]] for i in movable for part in range(PARTS)]
+        better = min(moves, key=uneven, default=chosen)
+        if uneven(better) > SURE * best:
+            return chosen
+        chosen, best = better, uneven(better)
+
+
+def _loads(chosen: list[Share], threads: int) -> list[float]:
+    """Return what each thread does of a level, where thread i does part i and each `threads`-th after it."""
+    loads = [0.0] * threads
+    for cost, _, part in chosen:
+        loads[part % threads] += cost
+    return loads
+
+
+class Costs:
+    """What operations and programs cost, in numbers that are multiplied or moved for each point."""
 
     def __init__(self) -> None:
-        self._known: dict[Program, bool] = {}
+        self._programs: dict[Program, float] = {}
+        self._shares: dict[Program, Shares] = {}
 
-    def of_program(self, program: Program) -> bool:
-        """Whether a program, or one that it calls, has products that are worth sharing."""
-        if program not in self._known:
-            self._known[program] = any(
-                any(map(self.of_program, called(operation)))
-                if operation.code in CALLS
-                else _has_weights(operation.detail)
-                for operation in program.operations
-                if operation.code in (*CALLS, "packed product", "pack")
-            )
-        return self._known[program]
+    def of(self, operation: Operation) -> float:
+        if operation.code in ("product", "packed product", "packed pair"):
+            m, k = operation.detail[:2]
+            return float(m * k * (2 if operation.code == "packed pair" else operation.detail[2]))
+        if operation.code in CALLS:
+            times = operation.detail[1] if operation.code == "repeat" else 1
+            return times * max(map(self.of_program, called(operation)))
+        return 0.0 if is_view(operation) else 4.0 * sum(output.size for output in operation.outputs)
 
-    @staticmethod
-    def of_step(step: Step) -> bool:
-        """Whether threads have rows of their own in a step of a program that is shared."""
-        operation = step[0]
-        if operation.is_elementwise:
-            return operation.outputs[0].size >= MANY_ROWS
-        return operation.code in ("packed product", "pack") and _has_weights(operation.detail)
+    def of_program(self, program: Program) -> float:
+        if program not in self._programs:
+            self._programs[program] = sum(map(self.of, program.operations))
+        return self._programs[program]
 
+    def is_costly(self, operation: Operation) -> bool:
+        return operation.code in _COSTLY and self.of(operation) >= COSTLY
 
-def _has_weights(detail: tuple[int, ...]) -> bool:
-    return detail[0] * detail[1] >= MANY_WEIGHTS
+    def shares(self, program: Program) -> Shares:
+        """Return a program in parts."""
+        if program not in self._shares:
+            self._shares[program] = Shares(program, self)
+        return self._shares[program]
+
+    def is_worth_sharing(self, program: Program) -> bool:
+        """Whether threads gain by sharing a program."""
+        return self.of_program(program) >= ENOUGH and self.shares(program).gain >= GAIN
+
+    def is_shared(self, operation: Operation) -> bool:
+        """Whether threads gain by sharing what is called."""
+        return operation.code in CALLS and all(map(self.is_worth_sharing, called(operation)))

@@ -26,8 +26,9 @@ def kernel_source(function: ca.Function, lanes: bool, single: bool) -> str:
     """
     early, late = Hoister(lanes).halves(gradient_program(function))
     writer = Writer()
-    early_name, early_work = writer.function(early, lanes=False)
-    late_name, late_work = writer.function(late, lanes=lanes)
+    shares = {program: writer.costs.is_worth_sharing(program) for program in (early, late)}
+    early_name, early_work = writer.function(early, False, shares[early])
+    late_name, late_work = writer.function(late, lanes, shares[late])
     numbers = {
         "N_ACTIONS": function.nnz_in(0),
         "N_SELECTIONS": function.nnz_in(1),
@@ -36,7 +37,7 @@ def kernel_source(function: ca.Function, lanes: bool, single: bool) -> str:
         "BLOCK": early.outputs[0].size,
         "EARLY_WORK": early_work,
         "LATE_WORK": late_work,
-        "SHARED": int(writer.sharing.of_program(late)),
+        "SHARED": int(shares[late]),
     }
     parts = [
         _PRECISION[single],
@@ -44,8 +45,8 @@ def kernel_source(function: ca.Function, lanes: bool, single: bool) -> str:
         _text("products.c"),
         _text("team.c"),
         writer.text(),
-        _entry("early", early_name, writer.sharing.of_program(early)),
-        _entry("late", late_name, writer.sharing.of_program(late)),
+        _entry("early", early_name, shares[early]),
+        _entry("late", late_name, shares[late]),
         *(f"#define {name} {value}" for name, value in numbers.items()),
         _text("search.c"),
         _text("kernel.c"),

@@ -1,10 +1,9 @@
-/* Threads that carry out each evaluation together. All of them go through the same steps; of long arrays and of products
-   with matrices of weights each does its own rows, and what is short the first one does alone. */
+/* Threads that carry out each evaluation together. All of them go through the same steps, each does those of its own parts,
+   and they meet before one touches what another one has written. */
 #ifdef __unix__
 #include <sched.h>
 #endif
-#define ROWS_AT_ONCE 16 /* whole panels, and whole vectors */
-#define SPINS 2000      /* looks at whether all have come, before the processor is left to others */
+#define SPINS 2000 /* looks at whether all have come, before the processor is left to others */
 
 struct team {
   long threads;
@@ -16,6 +15,7 @@ struct team {
 struct member {
   struct team *team;
   long index;
+  unsigned parts; /* of a program that are its own, bit by bit */
   long meetings;
   char apart[64]; /* so that no two members write to the same line of the cache */
 };
@@ -33,11 +33,4 @@ static void meet(struct member *me) {
     if (spins > SPINS) sched_yield();
 #endif
   }
-}
-
-/* Where the rows of a member begin, or of one behind it. */
-static inline long row_of(const struct member *me, long behind, long rows) {
-  const long units = (rows + ROWS_AT_ONCE - 1) / ROWS_AT_ONCE;
-  const long row = units * (me->index + behind) / me->team->threads * ROWS_AT_ONCE;
-  return row < rows ? row : rows;
 }

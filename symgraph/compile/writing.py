@@ -8,11 +8,10 @@ from itertools import islice
 import casadi as ca
 import numpy as np
 
-from symgraph.compile.differentiate import called
 from symgraph.compile.loops import Loop, number
-from symgraph.compile.program import CALLS, Indices, Operation, Program, Value, constant_of
+from symgraph.compile.program import Indices, Operation, Program, Value, constant_of
 from symgraph.compile.schedule import Schedule, Step
-from symgraph.compile.sharing import Access, By, Meetings, Sharing
+from symgraph.compile.sharing import Access, Costs, Meetings
 
 PART = 1000  # operations of one C function: the compiler's time grows faster than a function's length
 MOST_RUNS = 12  # copies that are written out; beyond that a table says what goes where
@@ -27,19 +26,19 @@ class Writer:
     """
 
     def __init__(self) -> None:
-        self.sharing = Sharing()
-        self._functions: dict[tuple[Program, bool], tuple[str, int]] = {}
+        self.costs = Costs()
+        self._functions: dict[tuple[Program, bool, bool], tuple[str, int]] = {}
         self._tables: dict[tuple[str, bytes], str] = {}
         self._externals: dict[int, tuple[ca.Function, ca.Function]] = {}
         self._text: list[str] = []
 
-    def function(self, program: Program, lanes: bool) -> tuple[str, int]:
+    def function(self, program: Program, lanes: bool, shared: bool) -> tuple[str, int]:
         """Write a program; return its name, and the numbers of workspace that it takes, for each lane."""
-        key = program, lanes
+        key = program, lanes, shared
         if key not in self._functions:
             name = f"f{len(self._functions)}"
             self._functions[key] = name, 0  # the name is taken while those that it calls are written
-            self._functions[key] = name, _FunctionWriter(self, program, lanes, name).write()
+            self._functions[key] = name, _FunctionWriter(self, program, lanes, shared, name).write()
         return self._functions[key]
 
     def text(self) -> str:
@@ -79,13 +78,14 @@ class Writer:
 class _FunctionWriter:
     """Writes one program, cut into functions of moderate length."""
 
-    def __init__(self, writer: Writer, program: Program, lanes: bool, name: str) -> None:
+    def __init__(self, writer: Writer, program: Program, lanes: bool, shared: bool, name: str) -> None:
         self._writer = writer
         self._program = program
         self._lanes = lanes
         self._name = name
-        self._schedule = Schedule(program, lanes)
-        self._shared = writer.sharing.of_program(program)
+        self._shared = shared
+        self._shares = writer.costs.shares(program).part if shared else None
+        self._schedule = Schedule(program, lanes, self._shares)
         self._meetings = Meetings()
         self._below = 0  # workspace of what is called
         self._lines: list[str] = []
@@ -93,7 +93,9 @@ class _FunctionWriter:
 
     def write(self) -> int:
         count = 0
-        for step in self._schedule.steps:
+        for i, step in enumerate(self._schedule.steps):
+            if self._shared and self._begins_level(i):
+                self._meet_before_level(i)
             begin = len(self._lines)
             self._write_step(step)
             if self._shared:
@@ -118,52 +120,53 @@ class _FunctionWriter:
     # threads
 
     def _share(self, step: Step, begin: int) -> None:
-        """Let the threads of a team do a step, whose lines begin there, together or by the first one alone."""
+        """Let the thread whose part a step is do it, whose lines begin there, or all of them together."""
+        part = self._part(step[0])
         if len(self._lines) == begin:
             return
-        if self._calls_shared(step[0]):
+        if part is None:
             due = self._meetings.is_due
             self._meetings.hold()  # what is called ends with a meeting
         else:
-            due = self._meetings.needed(self._accesses(step))
-            if not Sharing.of_step(step):
-                self._by_first(begin)
+            due = self._meetings.needed(self._accesses(step, part))
+            self._by_part(part, begin)
         if due:
             self._lines.insert(begin, "  meet(me);")
 
-    def _by_first(self, begin: int) -> None:
-        self._lines[begin:] = ["  if (me->index == 0) {", *self._lines[begin:], "  }"]
+    def _is_costly(self, i: int) -> bool:
+        return self._writer.costs.is_costly(self._schedule.steps[i][0])
 
-    def _calls_shared(self, operation: Operation) -> bool:
-        return operation.code in CALLS and any(map(self._writer.sharing.of_program, called(operation)))
+    def _begins_level(self, i: int) -> bool:
+        return self._is_costly(i) and not (i and self._is_costly(i - 1))
 
-    def _accesses(self, step: Step) -> list[Access]:
+    def _meet_before_level(self, i: int) -> None:
+        """Meet for what any costly step of a level needs: between them one part would wait while another one works."""
+        ahead = []
+        while i < len(self._schedule.steps) and self._is_costly(i):
+            part = self._part(self._schedule.steps[i][0])
+            ahead += [] if part is None else self._accesses(self._schedule.steps[i], part)
+            i += 1
+        if self._meetings.conflict(ahead):
+            self._meetings.hold()
+            self._lines.append("  meet(me);")
+
+    def _part(self, operation: Operation) -> int | None:
+        return None if self._shares is None else self._shares[operation]
+
+    def _by_part(self, part: int, begin: int) -> None:
+        self._lines[begin:] = [f"  if (me->parts & {1 << part}) {{", *self._lines[begin:], "  }"]
+
+    def _accesses(self, step: Step, part: int) -> list[Access]:
         """Return what a step reads and writes."""
-        size = step[0].outputs[0].size
         made = [output for operation in step for output in operation.outputs]
         within = set(made)
-        if step[0].is_elementwise:
-            made = [output for output in made if self._schedule.is_used_later(output, step)]
-        shared = Sharing.of_step(step)
-
-        def by(value: Value, writes: bool) -> By:
-            if not shared:
-                return By.FIRST
-            if step[0].is_elementwise:
-                return By.ROWS if value.size == size else By.ALL
-            # Of a packed matrix, and of a result with several columns, rows do not lie together.
-            return By.ROWS if writes and step[0].code == "packed product" and step[0].detail[2] == 1 else By.ALL
-
+        read = [arg for operation in step for arg in operation.args if arg not in within]
         return [
-            Access(self._schedule.place(value), value.size, by(value, writes), writes)
-            for values, writes in (((arg for o in step for arg in o.args if arg not in within), False), (made, True))
+            Access(self._schedule.place(value), value.size, part, writes)
+            for values, writes in ((read, False), (made, True))
             for value in values
             if constant_of(self._schedule.source(value)) is None
         ]
-
-    def _rows(self, size: int) -> tuple[str, str]:
-        """Return from which row on and up to which one this thread does a step."""
-        return (f"row_of(me, 0, {size})", f"row_of(me, 1, {size})") if self._shared else ("0", str(size))
 
     # where things are
 
@@ -199,8 +202,7 @@ class _FunctionWriter:
         for operation in step:
             loop.add(operation)
         stored = [o.outputs[0] for o in step if self._schedule.is_used_later(o.outputs[0], step)]
-        rows = self._rows(size) if Sharing.of_step(step) else ("0", str(size))
-        self._lines += loop.lines(stored, *rows)
+        self._lines += loop.lines(stored)
 
     def _write_gather(self, operation: Operation) -> None:
         (result,) = operation.outputs
@@ -264,18 +266,17 @@ class _FunctionWriter:
         m, k, transposed = operation.detail
         pointers = ", ".join(map(self._pointer, (*operation.args, *operation.outputs)))
         strides = f"{k}, 1" if transposed else f"1, {m}"
-        self._lines.append(f"  pack({pointers}, {m}, {k}, {strides}, {self._rows_of(operation)});")
+        self._lines.append(f"  pack({pointers}, {m}, {k}, {strides});")
 
     def _write_packed_product(self, operation: Operation) -> None:
         m, k, n, squared = operation.detail
         pointers = ", ".join(map(self._pointer, (*operation.args, *operation.outputs)))
         do = "multiply_packed_lanes" if self._lanes else ("multiply_squares" if squared else "multiply_packed")
-        lanes = ", B" if self._lanes else ""
-        self._lines.append(f"  {do}({pointers}, {m}, {k}, {n}, {self._rows_of(operation)}{lanes});")
+        self._lines.append(f"  {do}({pointers}, {m}, {k}, {n}{', B' if self._lanes else ''});")
 
-    def _rows_of(self, operation: Operation) -> str:
-        m = operation.detail[0]
-        return ", ".join(self._rows(m) if Sharing.of_step([operation]) else ("0", str(m)))
+    def _write_packed_pair(self, operation: Operation) -> None:
+        pointers = ", ".join(map(self._pointer, (*operation.args, *operation.outputs)))
+        self._lines.append(f"  multiply_pair({pointers}, {', '.join(map(str, operation.detail))});")
 
     def _write_accumulate(self, operation: Operation) -> None:
         result = operation.outputs[0]
@@ -289,14 +290,17 @@ class _FunctionWriter:
 
     # calls
 
-    def _call(self, program: Program, args: Sequence[str], results: Sequence[str], indent: str = "  ") -> list[str]:
-        name, work = self._writer.function(program, self._lanes)
+    def _call(
+        self, caller: Operation, program: Program, args: Sequence[str], results: Sequence[str], indent: str = "  "
+    ) -> list[str]:
+        shared = self._shared and self._part(caller) is None
+        name, work = self._writer.function(program, self._lanes, shared)
         self._below = max(self._below, work)
         given, made = ", ".join(args) or "0", ", ".join(results) or "0"
         return [
             f"{indent}{{ const real *const x[] = {{{given}}};",
             f"{indent}  real *const y[] = {{{made}}};",
-            f"{indent}  {name}(x, y, {self._free()}, B{', me' * self._writer.sharing.of_program(program)}); }}",
+            f"{indent}  {name}(x, y, {self._free()}, B{', me' * shared}); }}",
         ]
 
     def _free(self) -> str:
@@ -305,7 +309,7 @@ class _FunctionWriter:
 
     def _write_call(self, operation: Operation) -> None:
         args, results = map(self._pointer, operation.args), map(self._pointer, operation.outputs)
-        self._lines += self._call(operation.detail, list(args), list(results))
+        self._lines += self._call(operation, operation.detail, list(args), list(results))
 
     def _write_switch(self, operation: Operation) -> None:
         index, *args = map(self._pointer, operation.args)
@@ -316,11 +320,7 @@ class _FunctionWriter:
         for i, case in enumerate(cases):
             blocks = args[inputs + i : inputs + i + 1] if len(args) > inputs else []
             self._lines.append(f"    {'default' if i == len(cases) - 1 else f'case {i}'}:")
-            begin = len(self._lines)
-            self._lines += self._call(case, [*args[:inputs], *blocks], results, "      ")
-            if self._calls_shared(operation) and not self._writer.sharing.of_program(case):
-                self._by_first(begin)  # this one alone does not end with a meeting
-                self._lines.append("      meet(me);")
+            self._lines += self._call(operation, case, [*args[:inputs], *blocks], results, "      ")
             self._lines.append("      break;")
         self._lines.append("  }")
 
@@ -333,7 +333,7 @@ class _FunctionWriter:
 
         args, results = list(map(moving, operation.args)), list(map(moving, operation.outputs))
         self._lines.append(f"  {{ long i; for (i = 0; i < {times}; ++i)")
-        self._lines += self._call(program, args, results, "    ")
+        self._lines += self._call(operation, program, args, results, "    ")
         self._lines.append("  }")
 
     def _write_external(self, operation: Operation) -> None:
@@ -377,7 +377,7 @@ class _FunctionWriter:
         if self._shared:
             copies = len(self._lines) > begin
             if copies:
-                self._by_first(begin)
+                self._by_part(0, begin)
             if self._meetings.is_due:
                 self._lines.insert(begin, "  meet(me);")
             if copies:

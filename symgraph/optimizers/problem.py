@@ -147,7 +147,7 @@ class Problem:
         if choice.tobytes() not in self._scales:
             points = self.draw_points(np.random.default_rng(0), SCALE_SAMPLES, "spread")
             self.remember_scale(choice, self.values(points, np.tile(choice, (SCALE_SAMPLES, 1))))
-        return self._scales.get(choice.tobytes(), 1.0)
+        return self._scales.setdefault(choice.tobytes(), 1.0)
 
     def remember_scale(self, choice: Choices, values: Array) -> None:
         """Take the scale of choices (s,) from sampled values, if they are enough."""
