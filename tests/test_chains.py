@@ -148,7 +148,7 @@ def test_a_choice_aside_evaluates_what_is_chosen_alone():
 
 def test_what_goes_on_growing_uncertain_is_written_out():
     """From round to round one more label is uncertain."""
-    labels = [f"x{i}" for i in range(70)]
+    labels = [f"x{i}" for i in range(40)]
     slots = {label: sg.State() for label in labels} | {"u": sg.Action(low=-1, high=1)}
 
     def shift(**x):
@@ -157,8 +157,8 @@ def test_what_goes_on_growing_uncertain_is_written_out():
     shift.__signature__ = inspect.Signature([inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY) for n in labels])
     graph = sg.Graph(slots, start="here")
     graph.edge("here", "here", shift)
-    graph.reward("here", lambda x69, u: -(x69**2) - u**2)
-    objective = sg.Objective(sg.unroll(graph, max_visits=75), compiled=False)
+    graph.reward("here", lambda x39, u: -(x39**2) - u**2)
+    objective = sg.Objective(sg.unroll(graph, max_visits=45), compiled=False)
     state = dict.fromkeys(labels, 0.0) | {"x0": sg.Gaussian(1.0, 0.01)}
     assert np.isfinite(objective.value(state, {"u": 0.1}))
 

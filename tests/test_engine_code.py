@@ -29,6 +29,9 @@ static double *copied(const double *from, long long count) {
   return to;
 }
 
+static struct team team = {1};
+static struct member me = {&team, 0, ~0u};
+
 static void searched(int ascends, int limit, int parts, long long count, const double *points, const double *chosen,
                      const double *low, const double *high, const real *const *shared, const long long *sizes) {
   double *tolerances = memory(count, sizeof(double)), *scales = memory(count, sizeof(double));
@@ -49,7 +52,7 @@ static void searched(int ascends, int limit, int parts, long long count, const d
                    histories, outcomes, spent);
   }
   while (busy) {
-    for (part = 0; part < parts; ++part) symgraph_advance(searches[part], shared, work[part], 3);
+    for (part = 0; part < parts; ++part) symgraph_advance(&me, searches[part], shared, work[part], 3);
     for (busy = 0, i = 0; i < count; ++i) busy |= outcomes[i] < 0;
   }
   for (i = 0; i < count; ++i) {
@@ -65,7 +68,7 @@ static void searched(int ascends, int limit, int parts, long long count, const d
 }
 
 int main(void) {
-  long long sizes[4], counts[] = {1, 2, COUNT}, i;
+  long long sizes[5], counts[] = {1, 2, COUNT}, i;
   int c, stop = 0, n;
   real *shared[N_SHARED + 1], *early, *work;
   double *low = copied(LOW, N_ACTIONS), *high = copied(HIGH, N_ACTIONS);
@@ -77,13 +80,13 @@ int main(void) {
   shared[N_SHARED] = memory(sizes[0], sizeof(real));
   early = memory(sizes[1], sizeof(real));
   work = memory(sizes[2], sizeof(real));
-  symgraph_bind((const real *const *) shared, shared[N_SHARED], early);
+  symgraph_bind(&me, (const real *const *) shared, shared[N_SHARED], early);
   free(early);
   for (c = 0; c < 3; ++c) {
     long long count = counts[c];
     double *points = copied(POINTS, count * N_ACTIONS), *chosen = copied(CHOSEN, count * N_SELECTIONS);
     double *values = memory(count, sizeof(double)), *gradients = memory(count * N_ACTIONS, sizeof(double));
-    symgraph_evaluate(count, points, chosen, (const real *const *) shared, &stop, values, gradients, work);
+    symgraph_evaluate(&me, count, points, chosen, (const real *const *) shared, &stop, values, gradients, work);
     if (c == 2) {
       for (i = 0; i < count; ++i) printf("%.17g\\n", values[i]);
       for (i = 0; i < count * N_ACTIONS; ++i) printf("%.17g\\n", gradients[i]);

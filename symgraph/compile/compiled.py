@@ -27,6 +27,7 @@ SLICE = 0.05  # seconds of a search between two looks at what the user wants
 FIRST_ROUNDS = 16  # gradients before the first one
 ALIGNMENT = 64  # bytes: a cache line, and the longest vector
 SINGLE_TOLERANCE = 1e4  # times those of double precision
+MOST_SPARE = 2  # blocks of memory of one size that are kept
 FEW = 1000  # numbers that are compared one by one
 HEAVY = 256  # weights from which on single points have a kernel of their own
 
@@ -119,6 +120,19 @@ class Library:
         code.symgraph_sizes(sizes)
         self.block, self.early_work, self.work, self.search_bytes, shared = sizes
         self.shared = bool(shared)  # whether the members of a team share each evaluation; else threads share points
+        self._spare: dict[int, list[Array]] = {}
+
+    def memory(self, count: int) -> Array:
+        """Return room for numbers, of an earlier plan if there is some: to fetch megabytes anew takes milliseconds."""
+        try:
+            return self._spare[count].pop()
+        except (KeyError, IndexError):
+            return aligned(count, self.real)
+
+    def give_back(self, memory: Array) -> None:
+        spare = self._spare.setdefault(memory.size, [])
+        if len(spare) < MOST_SPARE:
+            spare.append(memory)
 
 
 class _Settings(ctypes.Structure):
@@ -144,12 +158,17 @@ class _Prepared:
     def __init__(self, library: Library, columns: Sequence[Array], threads: int) -> None:
         # Others may write to their own numbers later.
         self._columns = [column.copy() if column.flags.writeable else column for column in columns]
-        block, early = aligned(library.block, library.real), aligned(library.early_work, library.real)
-        self._kept = [*(np.ascontiguousarray(column, dtype=library.real) for column in self._columns), block]
+        self._library = library
+        self._block, early = library.memory(library.block), library.memory(library.early_work)
+        self._kept = [*(np.ascontiguousarray(column, dtype=library.real) for column in self._columns), self._block]
         self._pointers = (ctypes.c_void_p * len(self._kept))(*[address(column) for column in self._kept])
         self.address = ctypes.addressof(self._pointers)
-        given = self.address, address(block), address(early)
+        given = self.address, address(self._block), address(early)
         Crew(1, threads if library.shared else 1).work(library.code.symgraph_bind, [given])
+        library.give_back(early)
+
+    def __del__(self) -> None:
+        self._library.give_back(self._block)
 
     def serves(self, columns: Sequence[Array]) -> bool:
         """Whether other inputs are the same: the same memory, which nobody can change, or the same few numbers."""
@@ -169,8 +188,12 @@ class _Inputs:
         self.shared = prepared.address
         self.teams, members = (1, threads) if library.shared else (threads, 1)
         self.crew = Crew(self.teams, members)
-        self._workspaces = [aligned(library.work, library.real) for _ in range(self.teams)]
+        self._workspaces = [library.memory(library.work) for _ in range(self.teams)]
         self.work = [address(workspace) for workspace in self._workspaces]
+
+    def __del__(self) -> None:
+        for workspace in self._workspaces:
+            self.library.give_back(workspace)
 
 
 class _BoundCompiled(BoundKernel):
