@@ -7,7 +7,7 @@ belong together. Each such group is done by one thread, by that which made what 
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -17,12 +17,14 @@ from symgraph.compile.schedule import Place, is_view
 
 PARTS = 4  # into which a program is divided; each thread of a team does some of them
 COSTLY = 400  # numbers that an operation multiplies or moves, from which on it may stand for itself
-ENOUGH = 300_000  # that a program costs, from which on threads that wait for each other still gain
+ENOUGH = 300_000  # that products cost, from which on threads that wait for each other still gain
 ALONE = 0.7  # of a level's cost, from which on a call is shared instead of made beside others
-SURE = 0.95  # of how uneven loads are: less than that makes up for other threads having made what is needed
+MOST_NOTED = 2000  # accesses between two meetings: to compare all costs more than to meet
+UNEVEN = 1.05  # times the mean: so much may one thread have to do, where it made what is needed
 GAIN = 1.5  # of two threads, from which on they share evaluations rather than points
 
-_COSTLY = (*CALLS, "product", "packed product", "packed pair", "pack", "transpose", "external")
+_WITH_WEIGHTS = ("product", "packed product", "packed pair", "pack")
+_COSTLY = (*CALLS, *_WITH_WEIGHTS, "transpose", "external")
 
 
 class Access(NamedTuple):
@@ -50,7 +52,7 @@ class Meetings:
 
     def needed(self, accesses: list[Access]) -> bool:
         """Whether threads must meet before a step, since two parts touch what one of them writes; note the step."""
-        due = self.conflict(accesses)
+        due = self.conflict(accesses) or sum(map(len, self._since.values())) > MOST_NOTED
         if due:
             self.hold()
         for access in accesses:
@@ -137,10 +139,12 @@ class Shares:
         chosen: list[Share] = []
         costs = [sum(map(self._costs.of, group)) for group in groups]
         callees = [called(group[0]) if self._costs.is_shared(group[0]) else () for group in groups]
+        alike: Counter[tuple[Program, ...]] = Counter()
+        for cost, programs in zip(costs, callees, strict=True):
+            alike[programs] += cost  # type: ignore[assignment]  # costs are no whole numbers
         for cost, group, programs in zip(costs, groups, callees, strict=True):
             # Calls of one function, one after the other, find its weights near at hand.
-            alike = sum(other for other, others in zip(costs, callees, strict=True) if others == programs)
-            if programs and alike > ALONE * sum(costs):
+            if programs and alike[programs] > ALONE * sum(costs):
                 self.part |= dict.fromkeys(group)
                 together += cost / min(self._costs.shares(program).gain for program in programs)
             else:
@@ -162,19 +166,22 @@ class Shares:
 
 
 def _balanced(chosen: list[Share]) -> list[Share]:
-    """Move groups to other parts as long as loads become more even, for two threads and for one for each part."""
-
-    def uneven(some: list[Share]) -> float:
-        return sum(load**2 for threads in (2, PARTS) for load in _loads(some, threads))
-
-    best = uneven(chosen)
-    movable = [i for i, (cost, _, _) in enumerate(chosen) if cost >= COSTLY]
-    while True:
-        moves = [[*chosen[:i], (*chosen[i][:2], part), *chosen[i + 1 :]] for i in movable for part in range(PARTS)]
-        better = min(moves, key=uneven, default=chosen)
-        if uneven(better) > SURE * best:
-            return chosen
-        chosen, best = better, uneven(better)
+    """Move groups to other parts where loads are not even, for two threads and for one for each part."""
+    total = sum(cost for cost, _, _ in chosen)
+    loads = [0.0] * PARTS
+    balanced = []
+    for cost, group, nearest in sorted(chosen, key=lambda share: -share[0]):
+        part = nearest
+        if cost >= COSTLY:
+            halves = sum(loads[::2]), sum(loads[1::2])
+            half = nearest % 2
+            if halves[half] + cost > UNEVEN * total / 2 and halves[1 - half] < halves[half]:
+                half = 1 - half
+            near = nearest % 2 == half and loads[nearest] + cost <= UNEVEN * total / PARTS
+            part = nearest if near else min(range(half, PARTS, 2), key=loads.__getitem__)
+        loads[part] += cost
+        balanced.append((cost, group, part))
+    return balanced
 
 
 def _loads(chosen: list[Share], threads: int) -> list[float]:
@@ -190,6 +197,7 @@ class Costs:
 
     def __init__(self) -> None:
         self._programs: dict[Program, float] = {}
+        self._weights: dict[Program, float] = {}
         self._shares: dict[Program, Shares] = {}
 
     def of(self, operation: Operation) -> float:
@@ -197,8 +205,7 @@ class Costs:
             m, k = operation.detail[:2]
             return float(m * k * (2 if operation.code == "packed pair" else operation.detail[2]))
         if operation.code in CALLS:
-            times = operation.detail[1] if operation.code == "repeat" else 1
-            return times * max(map(self.of_program, called(operation)))
+            return self._times(operation) * max(map(self.of_program, called(operation)))
         return 0.0 if is_view(operation) else 4.0 * sum(output.size for output in operation.outputs)
 
     def of_program(self, program: Program) -> float:
@@ -215,9 +222,25 @@ class Costs:
             self._shares[program] = Shares(program, self)
         return self._shares[program]
 
+    def of_weights(self, program: Program) -> float:
+        """Return what products cost in a program and all that it calls."""
+        if program not in self._weights:
+            self._weights[program] = sum(
+                self._times(operation) * max(map(self.of_weights, called(operation)))
+                if operation.code in CALLS
+                else self.of(operation) * (operation.code in _WITH_WEIGHTS)
+                for operation in program.operations
+            )
+        return self._weights[program]
+
     def is_worth_sharing(self, program: Program) -> bool:
-        """Whether threads gain by sharing a program."""
-        return self.of_program(program) >= ENOUGH and self.shares(program).gain >= GAIN
+        """Whether threads gain by sharing a program: most of it are products, many of which do not need each other."""
+        weights = self.of_weights(program)
+        return weights >= max(ENOUGH, self.of_program(program) / 2) and self.shares(program).gain >= GAIN
+
+    @staticmethod
+    def _times(operation: Operation) -> int:
+        return int(operation.detail[1]) if operation.code == "repeat" else 1
 
     def is_shared(self, operation: Operation) -> bool:
         """Whether threads gain by sharing what is called."""
