@@ -108,6 +108,11 @@ def numbers(name, values):
     return f"static const double {name}[] = {{{text}}};\n"
 
 
+def source_of(*given):
+    (source,) = kernel_source(*given)
+    return source
+
+
 def with_main(source, points, selections, shared, low, high):
     order = np.lexsort(selections.T) if selections.shape[1] else np.arange(len(points))
     columns = [np.ravel(column, order="F") for column in shared]
@@ -187,7 +192,7 @@ some_slow = [pytest.param(name, marks=pytest.mark.slow) if name in LONG else nam
 
 def assert_clean(folder, name, flags, lanes, single):
     function, points, selections, shared, low, high = KERNELS[name]()
-    source, order = with_main(kernel_source(function, lanes, single), points, selections, shared, low, high)
+    source, order = with_main(source_of(function, lanes, single), points, selections, shared, low, high)
     got = run(folder, source, flags)
     shaped = [ca.reshape(ca.DM(np.ravel(x, order="F")), *function.size_in(2 + i)) for i, x in enumerate(shared)]
     values, gradients = expected(function, points[order], selections[order], shaped)
@@ -217,7 +222,7 @@ def test_everything_stays_within_its_arrays(tmp_path, name, processor, lanes, si
 def test_the_sanitizers_would_notice(tmp_path):
     """Too few numbers, to see that the tests above can fail."""
     function, points, selections, shared, low, high = KERNELS["random task 3"]()
-    source, _ = with_main(kernel_source(function, True, False), points, selections, shared, low, high)
+    source, _ = with_main(source_of(function, True, False), points, selections, shared, low, high)
     few = source.replace("work[part] = memory(sizes[2], ", "work[part] = memory(sizes[2] / 8, ")
     assert few != source
     with pytest.raises(AssertionError, match="heap-buffer-overflow"):
@@ -230,7 +235,7 @@ def test_it_compiles_without_warnings(tmp_path, name, lanes):
     function, *_ = KERNELS[name]()
     file = tmp_path / "kernel.c"
     for single in (False, True):
-        file.write_text(kernel_source(function, lanes, single))
+        file.write_text(source_of(function, lanes, single))
         warnings = ("-Wall", "-Wextra", "-Werror", "-Wno-unused-function", "-Wno-unused-parameter")
         macros, libraries = toolchain.vector_library()
         command = [toolchain.find_compiler(), "-shared", *toolchain.FLAGS, *macros, *warnings, str(file), "-o"]

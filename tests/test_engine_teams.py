@@ -191,7 +191,7 @@ def test_no_two_threads_touch_what_one_of_them_writes(name, lanes, tmp_path):
     if gcc is None or subprocess.run([gcc, "-fsanitize=thread", "-xc", "-", "-o", tmp_path / "probe"],
                                      input=b"int main(void) { return 0; }", check=False).returncode:  # fmt: skip
         pytest.skip("no compiler with ThreadSanitizer")
-    source = kernel_source(function_of(CASES[name], N, 1, SHAPES), lanes, single=False)
+    (source,) = kernel_source(function_of(CASES[name], N, 1, SHAPES), lanes, single=False)
     lengths = ", ".join(str(m * n) for m, n in SHAPES)
     constants = f"#define COUNT 20\n#define LENGTHS {{{lengths}}}\n#define PARTS {PARTS}\n"
     (tmp_path / "main.c").write_text(source + constants + MAIN)
@@ -282,5 +282,5 @@ def test_networks_beside_each_other_are_divided_evenly(count, gain):
 
 def test_a_network_and_what_follows_from_it_is_one_threads():
     """Two networks, two threads: they meet at the beginning and at the end."""
-    source = kernel_source(side_by_side(2), lanes=True, single=False)
+    (source,) = kernel_source(side_by_side(2), lanes=True, single=False)
     assert source.split("static void late(")[0].count("  meet(me);") <= 12  # of both halves

@@ -10,14 +10,15 @@ from symgraph.compile.differentiate import Differentiator
 from symgraph.compile.hoist import Hoister
 from symgraph.compile.program import Kind, Program
 from symgraph.compile.reading import Reader
+from symgraph.compile.units import in_units
 from symgraph.compile.writing import Writer, signature
 
 MOST_LANES = (64, 32, 16)  # points that are evaluated side by side: as many as have room in the cache
 CACHE = 6e6  # bytes of workspace that are still read fast
 
 
-def kernel_source(function: ca.Function, lanes: bool, single: bool) -> str:
-    """Return the source of a kernel.
+def kernel_source(function: ca.Function, lanes: bool, single: bool) -> list[str]:
+    """Return the source of a kernel, in one translation unit or several.
 
     Args:
         function: actions (n, 1), selections (m, 1) and what is bound to a kernel → value (1, 1).
@@ -39,19 +40,17 @@ def kernel_source(function: ca.Function, lanes: bool, single: bool) -> str:
         "LATE_WORK": late_work,
         "SHARED": int(shares[late]),
     }
-    parts = [
-        _PRECISION[single],
-        _text("lanes.c"),
-        _text("products.c"),
-        _text("team.c"),
-        writer.text(),
+    head = [_PRECISION[single], *map(_text, ("lanes.c", "products.c", "team.c"))]
+    tail = [
         _entry("early", early_name, shares[early]),
         _entry("late", late_name, shares[late]),
         *(f"#define {name} {value}" for name, value in numbers.items()),
-        _text("search.c"),
-        _text("kernel.c"),
+        *map(_text, ("search.c", "kernel.c")),
     ]
-    return "\n".join(parts)
+    casadi = writer.casadi()
+    if casadi:  # its functions are in one piece
+        return ["\n".join([*head, casadi, *writer.pieces, *tail])]
+    return in_units("\n".join(head), writer.pieces, "\n".join(tail))
 
 
 def _entry(name: str, function: str, shared: bool) -> str:

@@ -12,6 +12,7 @@ import subprocess
 import tempfile
 import warnings
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 
@@ -51,12 +52,12 @@ def find_compiler() -> str | None:
     return None
 
 
-def load(key: str, source: Callable[[], str], compiler: str) -> ctypes.CDLL:
+def load(key: str, source: Callable[[], list[str]], compiler: str) -> ctypes.CDLL:
     """Compile C source, or find it compiled, and load it.
 
     Args:
         key: what the source follows from.
-        source: makes it, where it is not found compiled.
+        source: makes it, one translation unit or several, where it is not found compiled.
         compiler: the path of the compiler.
 
     Raises:
@@ -85,18 +86,28 @@ def vector_library() -> tuple[tuple[str, ...], tuple[str, ...]]:
     return (), ("-lm",)
 
 
-def _compile(source: str, compiler: str, cache_folder: Path, key: str) -> Path:
+def _compile(units: list[str], compiler: str, cache_folder: Path, key: str) -> Path:
     # Compiled in a folder of its own and moved into place at once, so that processes may race for it.
-    with tempfile.TemporaryDirectory(dir=cache_folder) as folder:
-        source_file, made = Path(folder, "kernel.c"), Path(folder, "kernel.so")
-        source_file.write_text(source)
+    with tempfile.TemporaryDirectory(dir=cache_folder) as folder, ThreadPoolExecutor(os.cpu_count()) as pool:
+        made = Path(folder, "kernel.so")
         macros, libraries = vector_library()
-        command = [compiler, "-shared", *FLAGS, *macros, str(source_file), "-o", str(made), *libraries]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode != 0:
-            raise CompileError(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")
+
+        def compiled(i: int) -> str:
+            source, result = Path(folder, f"unit{i}.c"), Path(folder, f"unit{i}.o")
+            source.write_text(units[i])
+            _run([compiler, "-c", *FLAGS, *macros, str(source), "-o", str(result)])
+            return str(result)
+
+        objects = list(pool.map(compiled, range(len(units))))
+        _run([compiler, "-shared", *objects, "-o", str(made), *libraries])
         ctypes.CDLL(str(made))  # what cannot be loaded must not stay in the cache
         return made.replace(cache_folder / _name(key, made))
+
+
+def _run(command: list[str]) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise CompileError(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")
 
 
 def _name(key: str, path: Path) -> str:

@@ -41,9 +41,10 @@ class Writer:
             self._functions[key] = name, _FunctionWriter(self, program, lanes, shared, name).write()
         return self._functions[key]
 
-    def text(self) -> str:
-        """Return all that was written; CasADi's code for functions that have no program comes first."""
-        return "\n".join([self._casadi(), *self._text])
+    @property
+    def pieces(self) -> list[str]:
+        """Functions and tables, in order."""
+        return self._text
 
     def add(self, text: str) -> None:
         self._text.append(text)
@@ -66,7 +67,8 @@ class Writer:
             self._externals[key] = function, ca.Function(name, inputs, function.call(inputs, False, True))
         return self._externals[key][1]
 
-    def _casadi(self) -> str:
+    def casadi(self) -> str:
+        """Return CasADi's code for functions that have no program."""
         if not self._externals:
             return ""
         generator = ca.CodeGenerator("externals", {"with_header": False, "include_math": False})
