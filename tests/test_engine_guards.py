@@ -91,3 +91,38 @@ def test_what_is_chosen_and_not_finite_is_not_finite():
     values, gradients = bound(compiled(function)).evaluate(np.array([[-1.0], [2.0]]), NONE)
     np.testing.assert_array_equal(values, [np.nan, 2])
     np.testing.assert_array_equal(gradients[:, 0], [np.nan, 1])
+
+
+def long_root(x):
+    """A root, in a function that is too long to be written out where it is called."""
+    y = ca.MX.sym("y")
+    long = ca.sqrt(y)
+    for k in range(40):
+        long = ca.sin(long) + 0.01 * k
+    return ca.Function("long_root", [y], [long])(x)
+
+
+def mapped_root(x):
+    y = ca.MX.sym("y")
+    return ca.sum2(ca.Function("root", [y], [long_root(y)]).map(2)(ca.horzcat(x, x)))
+
+
+CALLED = {"call": long_root, "map": mapped_root}
+
+
+@pytest.mark.parametrize("build", ["lanes", "narrow"])
+@pytest.mark.parametrize("name", CALLED)
+def test_of_what_is_called(name, build):
+    """Slopes within functions that are called do not count either where the calls are not chosen."""
+    called = CALLED[name]
+
+    def body(u, s):
+        return ca.if_else(u[0] > 0, called(u[0]), 0) + ca.if_else(u[1] > 0, called(u[1]), 0) + ca.sum1(u)
+
+    kernel = bound(compiled(function_of(body, 2), build))
+    points, step = np.array([[-1.0, 0.7], [0.3, -2.0], [0.2, 0.9]]), 1e-6
+    values, gradients = kernel.evaluate(points, np.zeros((3, 0)))
+    assert np.isfinite(values).all()
+    for i in range(2):
+        ends = [kernel.evaluate(points + k * step * np.eye(2)[i], np.zeros((3, 0)))[0] for k in (1, -1)]
+        np.testing.assert_allclose(gradients[:, i], (ends[0] - ends[1]) / (2 * step), atol=1e-7)

@@ -1,7 +1,10 @@
 """Threads that share each evaluation: to the last bit what one finds, and none touches what another one writes."""
 
+import ctypes
+import os
 import shutil
 import subprocess
+import threading
 
 import casadi as ca
 import numpy as np
@@ -9,8 +12,9 @@ import pytest
 from compiled_functions import bound, code_for, compiled, function_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from wrapped_kernels import ctrl_c_after
 
-from symgraph.compile import sharing
+from symgraph.compile import crew, sharing
 from symgraph.compile.hoist import Hoister
 from symgraph.compile.schedule import Place
 from symgraph.compile.sharing import PARTS, Access, Costs, Meetings
@@ -25,6 +29,7 @@ def layer(name, m, n):
     return ca.Function(name, [w, x], [ca.tanh(w @ x) + 0.1 * ca.sin(x[0])])
 
 
+WEIGHTS = ca.MX.sym("a", ODD, ODD)
 FIRST, SECOND, THIRD = layer("first", WIDE, N), layer("second", ODD, WIDE), layer("third", ODD, ODD)
 
 
@@ -61,12 +66,28 @@ def matrices(u, s, w, v, a, b, p):
     return ca.sumsqr(b @ (a.T @ y + (a**2) @ ca.cos(y)) @ p[0]) + ca.sumsqr(a.T**2 @ y[:, 2])
 
 
-CASES = {"straight": straight, "mapped": mapped, "switched": switched, "matrices": matrices}
+def beside(u, s, w, v, a, b, p):
+    """Functions that are called beside each other, by other threads: some shared, some not, one of CasADi's own."""
+    x = ca.MX.sym("x", ODD)
+    inner = [ca.Function("inner", [a_, x], [ca.tanh(a_ @ ca.sin(k * x))]) for k, a_ in ((1, WEIGHTS), (2, WEIGHTS))]
+    table = ca.interpolant("table", "bspline", [np.linspace(-9, 9, 30)], np.cos(np.linspace(-9, 9, 30)))
+    begin = [SECOND(v, FIRST(w, u * k)) for k in (1, 2, 3, 4)]
+    each = [inner[k % 2](a, inner[k % 2](a, y)) for k, y in enumerate(begin)]
+    return ca.sumsqr(ca.vertcat(*each)) + sum(table(ca.sum1(y)) * ca.sumsqr(y) for y in begin)
+
+
+CASES = {"straight": straight, "mapped": mapped, "switched": switched, "matrices": matrices, "beside": beside}
 
 
 def numbers():
     rng = np.random.default_rng(3)
     return [rng.normal(size=shape) / np.sqrt(shape[1]) for shape in SHAPES]
+
+
+def nothing_that_is_called_is_shared(patch):
+    """Each thread calls functions of its own then."""
+    patch.setenv("XDG_CACHE_HOME", os.environ["XDG_CACHE_HOME"] + "-alone")
+    patch.setattr(sharing.Costs, "is_shared", lambda self, operation: False)
 
 
 def points_of(count):
@@ -84,7 +105,7 @@ def shared_however_small(tmp_path_factory):
         yield
 
 
-@pytest.fixture(scope="module", params=["lanes", "narrow", "single"])
+@pytest.fixture(scope="module", params=["lanes", "narrow", "single", "lanes, functions not shared"])
 def kernels(request):
     build = "narrow" if request.param == "narrow" else "lanes"
     return {
@@ -183,15 +204,17 @@ int main(void) {
 """
 
 
-@pytest.mark.parametrize("lanes", [True, False], ids=["lanes", "narrow"])
+@pytest.mark.parametrize("build", ["lanes", "narrow", "lanes, functions not shared"])
 @pytest.mark.parametrize("name", CASES)
-def test_no_two_threads_touch_what_one_of_them_writes(name, lanes, tmp_path):
+def test_no_two_threads_touch_what_one_of_them_writes(name, build, tmp_path, monkeypatch):
     """ThreadSanitizer watches all that generated code reads and writes."""
+    if "not shared" in build:
+        nothing_that_is_called_is_shared(monkeypatch)
     gcc = shutil.which("gcc")
     if gcc is None or subprocess.run([gcc, "-fsanitize=thread", "-xc", "-", "-o", tmp_path / "probe"],
                                      input=b"int main(void) { return 0; }", check=False).returncode:  # fmt: skip
         pytest.skip("no compiler with ThreadSanitizer")
-    (source,) = kernel_source(function_of(CASES[name], N, 1, SHAPES), lanes, single=False)
+    (source,) = kernel_source(function_of(CASES[name], N, 1, SHAPES), build != "narrow", single=False)
     lengths = ", ".join(str(m * n) for m, n in SHAPES)
     constants = f"#define COUNT 20\n#define LENGTHS {{{lengths}}}\n#define PARTS {PARTS}\n"
     (tmp_path / "main.c").write_text(source + constants + MAIN)
@@ -210,6 +233,47 @@ def test_other_processors_share_too():
         *(bound(kernel, numbers(), threads).evaluate(*points_of(9)) for threads in (1, 2)), strict=True
     ):
         np.testing.assert_array_equal(got, wanted)
+
+
+# The threads
+
+
+def test_a_team_that_was_interrupted_works_again(kernels):
+    kernel = bound(kernels["straight"], numbers(), 2)
+    wanted = kernel.evaluate(*points_of(40))
+
+    def go_on():
+        while True:
+            kernel.evaluate(*points_of(40))
+
+    with pytest.raises(KeyboardInterrupt), ctrl_c_after(0.3):
+        go_on()
+    for _ in range(5):
+        for got, one in zip(kernel.evaluate(*points_of(40)), wanted, strict=True):
+            np.testing.assert_array_equal(got, one)
+
+
+@pytest.mark.parametrize("place", range(3))
+def test_nobody_waits_for_a_member_that_failed(place):
+    def meet(member):
+        index = members.setdefault(member, len(members))
+        if index == place:
+            raise MemoryError
+        team = ctypes.cast(member, ctypes.POINTER(ctypes.c_void_p))[0]
+        broken = ctypes.c_int.from_address(team + crew._Team.broken.offset)
+        while not broken.value:
+            threading.Event().wait(0.001)
+
+    members = {}
+    with pytest.raises(MemoryError):
+        crew.Crew(1, 3).work(meet, [()])
+
+
+@pytest.mark.parametrize(("threads", "teams", "members"), [(1, 1, 1), (2, 1, 2), (4, 1, 4), (5, 1, 4), (8, 2, 4)])
+def test_more_threads_than_parts_are_several_teams(kernels, threads, teams, members):
+    library = kernels["straight"].wide
+    assert library.shared
+    assert (threads // library.members(threads), library.members(threads)) == (teams, members)
 
 
 ACCESSES = st.lists(

@@ -322,3 +322,26 @@ def test_slow_starts_do_not_keep_others_waiting():
     assert index == 0
     assert len(slow.history) > 500
     assert {len(end.history) for p, end in found if p} == {2}
+
+
+# Where rounding hides what is gained
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e6, 1e8])
+@pytest.mark.parametrize("kind", ["kink", "smooth", "quadratic"])
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_climb_ends_at_the_best_that_it_met(compiled, kind, offset):
+    """Steps whose gain rounding hides may lead down a little; what is handed out is the best, right to rounding."""
+    c = np.array([0.3, -0.7, 0.1])
+    shapes = {
+        "kink": lambda u: -ca.sum1(ca.fabs(u - c)),
+        "smooth": lambda u: -ca.sum1(ca.sqrt((u - c) ** 2 + 1e-6)),
+        "quadratic": lambda u: -ca.sumsqr((u - c) * [1, 5, 20]),
+    }
+    objective = over_box(lambda u: offset + shapes[kind](u), np.full(3, -1), np.full(3, 1))
+    kernel = kernels(objective)[compiled]
+    starts = np.random.default_rng(2).uniform(-1, 1, (12, 3))
+    best = objective.value({}, {"u": c})
+    for _, ended in kernel.climb(starts, np.zeros((12, 0)), 500, np.full(12, 1e-9)):
+        assert ended.value >= ended.history.max() - 4 * np.spacing(abs(offset) + 1)
+        assert objective.value({}, {"u": ended.point}) >= best - 1e-8 - 30 * np.spacing(offset)

@@ -18,6 +18,7 @@ import numpy as np
 from symgraph.compile.crew import Crew
 from symgraph.compile.kernel import NEVER, AdadeltaSteps, BoundKernel, Ended, Kernel, Outcome, Stop
 from symgraph.compile.rules import rules_in
+from symgraph.compile.sharing import PARTS
 from symgraph.compile.source import kernel_source
 from symgraph.compile.toolchain import load
 from symgraph.errors import CompileError
@@ -122,10 +123,14 @@ class Library:
         self.shared = bool(shared)  # whether the members of a team share each evaluation; else threads share points
         self._spare: dict[int, list[Array]] = {}
 
+    def members(self, threads: int) -> int:
+        """Return how many of so many threads make a team."""
+        return min(threads, PARTS) if self.shared else 1
+
     def memory(self, count: int) -> Array:
         """Return room for numbers, of an earlier plan if there is some: to fetch megabytes anew takes milliseconds."""
         try:
-            return self._spare[count].pop()
+            return self._spare[max(1, count)].pop()
         except (KeyError, IndexError):
             return aligned(count, self.real)
 
@@ -156,15 +161,15 @@ class _Prepared:
     """Bound inputs of a library, and what follows from them; only read from here on, by any thread."""
 
     def __init__(self, library: Library, columns: Sequence[Array], threads: int) -> None:
+        self._library, self._block = library, library.memory(library.block)
         # Others may write to their own numbers later.
         self._columns = [column.copy() if column.flags.writeable else column for column in columns]
-        self._library = library
-        self._block, early = library.memory(library.block), library.memory(library.early_work)
+        early = library.memory(library.early_work)
         self._kept = [*(np.ascontiguousarray(column, dtype=library.real) for column in self._columns), self._block]
         self._pointers = (ctypes.c_void_p * len(self._kept))(*[address(column) for column in self._kept])
         self.address = ctypes.addressof(self._pointers)
         given = self.address, address(self._block), address(early)
-        Crew(1, threads if library.shared else 1).work(library.code.symgraph_bind, [given])
+        Crew(1, library.members(threads)).work(library.code.symgraph_bind, [given])
         library.give_back(early)
 
     def __del__(self) -> None:
@@ -183,12 +188,12 @@ class _Inputs:
     """What a library needs to evaluate: bound inputs, threads, and workspace for each of their teams."""
 
     def __init__(self, library: Library, prepared: _Prepared, threads: int) -> None:
-        self.library = library
+        members = library.members(threads)
+        self.library, self.teams = library, threads // members
+        self._workspaces = [library.memory(library.work) for _ in range(self.teams)]
         self._prepared = prepared
         self.shared = prepared.address
-        self.teams, members = (1, threads) if library.shared else (threads, 1)
         self.crew = Crew(self.teams, members)
-        self._workspaces = [library.memory(library.work) for _ in range(self.teams)]
         self.work = [address(workspace) for workspace in self._workspaces]
 
     def __del__(self) -> None:

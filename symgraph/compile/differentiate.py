@@ -51,6 +51,7 @@ class Differentiator:
         sweep = _Sweep(self, joint, inputs)
         results = sweep.forward(program)
         made = set(map(id, joint.operations))
+        sweep.guard(results)  # wherever it is called the adjoints may be guarded
         sweep.reverse(zip(results, seeds, strict=True))
         adjoints = [sweep.adjoint(x) for x in inputs if x.kind == Kind.LANE]
         forward, tape = _forward_part(joint, inputs, results, adjoints, made)
@@ -208,6 +209,10 @@ class _Sweep:
                     )
                     self._pass_on(operation, adjoints)
                     self._guards = False
+
+    def guard(self, values: Iterable[Value]) -> None:
+        """Expect that conditions set adjoints of values to zero."""
+        self._guarded.update(values)
 
     def adjoint(self, value: Value) -> Value:
         """Return the adjoint of an input."""

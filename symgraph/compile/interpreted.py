@@ -20,7 +20,7 @@ SMALLEST_GAIN = 1e-15
 MOST_PAIRS = 8
 CURVATURE = 0.9
 LOOSE = 1e3
-HIDDEN = 1e-12
+HIDDEN = 10.0
 DECREASE = 0.1
 MOST_ROUNDS = 10
 MOST_TRIES = 50
@@ -125,6 +125,7 @@ class _BoundInterpreted(BoundKernel):
         d, descent, longest, slope = np.zeros_like(u), 0.0, 0.0, 0.0
         t, t_low, t_high = 1.0, 0.0, np.inf  # steps between which the line search looks
         f_low, u_low, g_low = f, u, g
+        f_best, u_best, flattest = f, u, np.inf
         while True:
             noise = SMALLEST_GAIN * abs(f)
             accepted = False
@@ -132,11 +133,12 @@ class _BoundInterpreted(BoundKernel):
                 iterations, outcome = len(history), "time limit"
             if fresh:
                 free = ~((span <= 0.0) | ((u <= 0.0) & (g > 0.0)) | ((u >= 1.0) & (g < 0.0)))
-                before, slope = slope, float(np.abs(g * free).max(initial=0.0))
+                slope = float(np.abs(g * free).max(initial=0.0))
                 if slope <= tolerance:
                     outcome = "converged"
                     break
-                flat = 0 if slope < before / 2.0 else flat  # a gain that values are too coarse for
+                if slope < flattest / 2.0:  # a gain that values are too coarse for
+                    flattest, flat = slope, 0
                 d = _direction(pairs, u, g, free.astype(float))
                 if pairs and 0.0 < -(d @ g) <= noise and slope <= LOOSE * tolerance:
                     outcome = "converged"  # rounding would hide what is left to gain
@@ -155,7 +157,7 @@ class _BoundInterpreted(BoundKernel):
                 slope_trial = float(g_trial @ (d * ((trial > 0.0) & (trial < 1.0))))
                 tries += 1
                 gained = f_trial <= f + ARMIJO * predicted + noise or (
-                    f_trial <= f + HIDDEN * abs(f)
+                    f_trial <= f_best + HIDDEN * noise
                     and CURVATURE * descent <= slope_trial <= (2.0 * DECREASE - 1.0) * descent
                 )
                 if finite and predicted < 0.0 and gained:  # the best so far, if not yet a good one
@@ -186,6 +188,8 @@ class _BoundInterpreted(BoundKernel):
                 elif tries == 1 or doubted:
                     flat += 1
                 u, f, g, fresh = u_low, f_low, g_low, True
+                if f < f_best:
+                    f_best, u_best = f, u
             if len(history) >= iterations:
                 break
             history.append(-(min(f, f_low) if t_low > 0.0 and not accepted else f))
@@ -196,7 +200,7 @@ class _BoundInterpreted(BoundKernel):
                 flat, doubted, pairs = 0, True, []
             if outcome != "iteration limit":
                 break
-        return Ended(place(u), -f, cast(Outcome, outcome), np.array(history))
+        return Ended(place(u_best), -f_best, cast(Outcome, outcome), np.array(history))
 
     def _ascend(self, start: Array, selection: Array, limit: int, steps: AdadeltaSteps, scale: float) -> Ended:
         x, low, high = start.copy(), self._low, self._high

@@ -26,7 +26,7 @@ static const double LONGEST_STEP = 0.5;    /* [range] no step crosses more than 
 static const double ARMIJO = 1e-4;         /* sufficient decrease: Nocedal & Wright 2006, equation 3.4 */
 static const double CURVATURE = 0.9;       /* how much flatter a step must end: equation 3.6b there */
 static const double LOOSE = 1e3;           /* times the tolerance: converged where rounding hides all further gain */
-static const double HIDDEN = 1e-12;        /* relative to the value: differences in which rounding may outweigh what is gained */
+static const double HIDDEN = 10;           /* times the smallest gain: so far below the best so far slopes decide */
 static const double DECREASE = 0.1;        /* there slopes decide: Hager & Zhang 2005, equation 4.1 */
 static const int MOST_ROUNDS = 10;         /* of sending actions to their bounds */
 static const int MOST_TRIES = 50;          /* steps of one line search */
@@ -148,8 +148,10 @@ struct walk {
   double f, f_low, descent, longest, slope, predicted;
   double t, t_low, t_high; /* steps between which the line search looks */
   int fresh, flat, tries, doubted;
+  double best[N_ACTIONS + 1], best_value; /* of L-BFGS a point u, of ADADELTA a point x */
+  double flattest;                        /* the smallest slope so far */
   /* of ADADELTA, of which u is the last point, g the gradient there */
-  double mean_square[N_ACTIONS + 1], mean_move[N_ACTIONS + 1], best[N_ACTIONS + 1], best_value;
+  double mean_square[N_ACTIONS + 1], mean_move[N_ACTIONS + 1];
   int falls;
   double scratch[3][N_ACTIONS + 1]; /* here, since the stack may be small */
 };
@@ -181,7 +183,9 @@ static void accept(struct walk *k, double noise) {
   for (i = 0; i < N_ACTIONS; ++i) {
     k->u[i] = k->u_low[i];
     k->g[i] = k->g_low[i];
+    if (-k->f > k->best_value) k->best[i] = k->u[i];
   }
+  k->best_value = larger(k->best_value, -k->f);
   k->fresh = 1;
 }
 
@@ -195,7 +199,6 @@ static int climb_on(struct walk *k, const struct settings *set) {
   }
   if (k->fresh) {
     double *const mask = k->scratch[0], *const free = k->scratch[1], *const to_bound = k->scratch[2];
-    const double before = k->slope;
     k->slope = 0;
     for (i = 0; i < N_ACTIONS; ++i) {
       int held = high[i] <= low[i] || (k->u[i] <= 0 && k->g[i] > 0) || (k->u[i] >= 1 && k->g[i] < 0);
@@ -206,7 +209,10 @@ static int climb_on(struct walk *k, const struct settings *set) {
       k->outcome = CONVERGED;
       return 0;
     }
-    if (k->slope < before / 2) k->flat = 0; /* a gain that values are too coarse for */
+    if (k->slope < k->flattest / 2) { /* a gain that values are too coarse for */
+      k->flattest = k->slope;
+      k->flat = 0;
+    }
     k->descent = direction(&k->pairs, k->u, k->g, mask, k->d, to_bound);
     if (k->pairs.stored && k->descent < 0 && -k->descent <= SMALLEST_GAIN * fabs(k->f) && k->slope <= LOOSE * k->tolerance) {
       k->outcome = CONVERGED; /* rounding would hide what is left to gain */
@@ -255,7 +261,12 @@ static int climb(struct walk *k, const struct settings *set, double value, doubl
     k->history[k->spent++] = finite ? value : -INFINITY;
     k->f = finite ? f_trial : INFINITY;
     k->outcome = finite ? ITERATION_LIMIT : NOT_FINITE;
-    for (i = 0; i < N_ACTIONS; ++i) k->g[i] = g_trial[i];
+    k->best_value = -k->f;
+    k->flattest = INFINITY;
+    for (i = 0; i < N_ACTIONS; ++i) {
+      k->g[i] = g_trial[i];
+      k->best[i] = k->u[i];
+    }
     k->fresh = 1;
     return finite && climb_on(k, set);
   }
@@ -264,7 +275,7 @@ static int climb(struct walk *k, const struct settings *set, double value, doubl
     if (k->trial[i] > 0 && k->trial[i] < 1) slope_trial += g_trial[i] * k->d[i];
   gained = finite && k->predicted < 0 &&
            (f_trial <= k->f + ARMIJO * k->predicted + noise ||
-            (f_trial <= k->f + HIDDEN * fabs(k->f) && slope_trial >= CURVATURE * k->descent &&
+            (f_trial <= -k->best_value + HIDDEN * noise && slope_trial >= CURVATURE * k->descent &&
              slope_trial <= (2 * DECREASE - 1) * k->descent));
   ++k->tries;
   if (gained) { /* the best step so far, if not yet a good one */
@@ -397,8 +408,8 @@ static void end_walk(struct walk *k, const struct search *all) {
   double *end = all->ends + k->start * N_ACTIONS;
   int i;
   if (!all->set.ascends) {
-    place(k->u, all->set.low, all->set.high, k->x);
-    k->value = -k->f;
+    place(k->best, all->set.low, all->set.high, k->x);
+    k->value = k->best_value;
   } else if (all->set.keep_best) {
     for (i = 0; i < N_ACTIONS; ++i) k->x[i] = k->best[i];
     k->value = k->best_value;

@@ -51,7 +51,7 @@ class Meetings:
         self._since = {}
 
     def needed(self, accesses: list[Access]) -> bool:
-        """Whether threads must meet before a step, since two parts touch what one of them writes; note the step."""
+        """Whether threads must meet before a step, since parts touch what one writes, or much was noted; note it."""
         due = self.conflict(accesses) or sum(map(len, self._since.values())) > MOST_NOTED
         if due:
             self.hold()

@@ -8,10 +8,11 @@ from itertools import islice
 import casadi as ca
 import numpy as np
 
+from symgraph.compile.differentiate import called
 from symgraph.compile.loops import Loop, number
-from symgraph.compile.program import Indices, Operation, Program, Value, constant_of
+from symgraph.compile.program import CALLS, Indices, Operation, Program, Value, constant_of
 from symgraph.compile.schedule import Schedule, Step
-from symgraph.compile.sharing import Access, Costs, Meetings
+from symgraph.compile.sharing import PARTS, Access, Costs, Meetings
 
 PART = 1000  # operations of one C function: the compiler's time grows faster than a function's length
 MOST_RUNS = 12  # copies that are written out; beyond that a table says what goes where
@@ -89,7 +90,11 @@ class _FunctionWriter:
         self._shares = writer.costs.shares(program).part if shared else None
         self._schedule = Schedule(program, lanes, self._shares)
         self._meetings = Meetings()
-        self._below = 0  # workspace of what is called
+        calling = [step[0] for step in self._schedule.steps if step[0].code in (*CALLS, "external")]
+        # Workspace of what is called: each part has some of its own, what they call together may have all of it.
+        self._room_of_part = max((self._room(o) for o in calling if not self._together(o)), default=0)
+        together = max((self._room(o) for o in calling if self._together(o)), default=0)
+        self._below = max(together, self._room_of_part * (PARTS if shared else 1))
         self._lines: list[str] = []
         self._parts: list[str] = []
 
@@ -111,6 +116,19 @@ class _FunctionWriter:
         calls = "\n".join(f"  {part}(arg, res, w, B{', me' * self._shared});" for part in self._parts)
         self._writer.add(f"static void {self._name}{signature(self._shared)} {{\n{calls}\n}}")
         return self._schedule.work + self._below
+
+    def _room(self, operation: Operation) -> int:
+        """Return the workspace of what an operation calls."""
+        if operation.code in CALLS:
+            together = self._together(operation)
+            functions = (self._writer.function(program, self._lanes, together) for program in called(operation))
+            return max(work for _, work in functions)
+        if operation.code == "external":
+            function = self._writer.external(operation.detail)
+            count = sum(x.size for x in (*operation.args, *operation.outputs))
+            # Doubles, one in the room of two numbers in single precision, and one more to begin where one may.
+            return 2 * (count + function.sz_w() + 1)
+        return 0
 
     def _end_part(self) -> None:
         if self._lines:
@@ -295,19 +313,23 @@ class _FunctionWriter:
     def _call(
         self, caller: Operation, program: Program, args: Sequence[str], results: Sequence[str], indent: str = "  "
     ) -> list[str]:
-        shared = self._shared and self._part(caller) is None
-        name, work = self._writer.function(program, self._lanes, shared)
-        self._below = max(self._below, work)
+        shared = self._together(caller)
+        name, _ = self._writer.function(program, self._lanes, shared)
         given, made = ", ".join(args) or "0", ", ".join(results) or "0"
         return [
             f"{indent}{{ const real *const x[] = {{{given}}};",
             f"{indent}  real *const y[] = {{{made}}};",
-            f"{indent}  {name}(x, y, {self._free()}, B{', me' * shared}); }}",
+            f"{indent}  {name}(x, y, {self._free(caller)}, B{', me' * shared}); }}",
         ]
 
-    def _free(self) -> str:
-        """Return where workspace for what is called begins."""
-        return f"w + {self._schedule.work}{' * B' if self._lanes else ''}"
+    def _together(self, operation: Operation) -> bool:
+        """Whether all threads call what an operation calls, and share it."""
+        return self._shared and self._part(operation) is None
+
+    def _free(self, operation: Operation) -> str:
+        """Return where workspace for what an operation calls begins."""
+        begin = self._schedule.work + (self._part(operation) or 0) * self._room_of_part
+        return f"w + {begin}{' * B' if self._lanes else ''}"
 
     def _write_call(self, operation: Operation) -> None:
         args, results = map(self._pointer, operation.args), map(self._pointer, operation.outputs)
@@ -341,15 +363,12 @@ class _FunctionWriter:
     def _write_external(self, operation: Operation) -> None:
         """CasADi's own code does one lane after the other, with doubles of its own."""
         function = self._writer.external(operation.detail)
-        count = sum(x.size for x in (*operation.args, *operation.outputs))
         wide = self._wide(operation.outputs[0])
-        # Doubles, of which one takes the room of two numbers in single precision, and one more to begin where one may.
-        self._below = max(self._below, 2 * (count + function.sz_w() + 1))
         lines = [
             "  { long l;",
             f"    const double *x[{function.sz_arg() + 1}]; double *y[{function.sz_res() + 1}];",
             f"    casadi_int iw[{function.sz_iw() + 1}]; int failed;",
-            f"    double *const s = doubles({self._free()});",
+            f"    double *const s = doubles({self._free(operation)});",
             f"    for (l = 0; l < {'B' if wide else 1}; ++l) {{",
         ]
         at = 0
