@@ -9,71 +9,20 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator
-from typing import NamedTuple
 
 from symgraph.compile.differentiate import called
 from symgraph.compile.program import CALLS, Kind, Operation, Program
-from symgraph.compile.schedule import Place, is_view
+from symgraph.compile.schedule import is_view
 
 PARTS = 4  # into which a program is divided; each thread of a team does some of them
 COSTLY = 400  # numbers that an operation multiplies or moves, from which on it may stand for itself
 ENOUGH = 300_000  # that products cost, from which on threads that wait for each other still gain
 ALONE = 0.7  # of a level's cost, from which on a call is shared instead of made beside others
-MOST_NOTED = 2000  # accesses between two meetings: to compare all costs more than to meet
 UNEVEN = 1.05  # times the mean: so much may one thread have to do, where it made what is needed
 GAIN = 1.5  # of two threads, from which on they share evaluations rather than points
 
 _WITH_WEIGHTS = ("product", "packed product", "packed pair", "pack")
 _COSTLY = (*CALLS, *_WITH_WEIGHTS, "transpose", "external")
-
-
-class Access(NamedTuple):
-    """A part reads an array or writes it."""
-
-    place: Place
-    size: int
-    part: int
-    writes: bool
-
-
-class Meetings:
-    """Keeps what was touched since threads last met, to say when they must meet again."""
-
-    def __init__(self) -> None:
-        self._since: dict[str, list[Access]] = {}
-
-    @property
-    def is_due(self) -> bool:
-        """Whether anything was touched since."""
-        return bool(self._since)
-
-    def hold(self) -> None:
-        self._since = {}
-
-    def needed(self, accesses: list[Access]) -> bool:
-        """Whether threads must meet before a step, since parts touch what one writes, or much was noted; note it."""
-        due = self.conflict(accesses) or sum(map(len, self._since.values())) > MOST_NOTED
-        if due:
-            self.hold()
-        for access in accesses:
-            self._since.setdefault(access.place.base, []).append(access)
-        return due
-
-    def conflict(self, accesses: list[Access]) -> bool:
-        """Whether another part has touched what is written now, or written what is touched."""
-        return any(
-            _conflict(before, access) for access in accesses for before in self._since.get(access.place.base, [])
-        )
-
-
-def _conflict(one: Access, other: Access) -> bool:
-    if one.part == other.part or not (one.writes or other.writes):
-        return False
-    begin, end = (
-        max(one.place.offset, other.place.offset),
-        min(one.place.offset + one.size, other.place.offset + other.size),
-    )
-    return begin < end
 
 
 Share = tuple[float, list[Operation], int]  # what a group of operations costs, the group, the part it is of

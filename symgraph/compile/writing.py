@@ -10,9 +10,10 @@ import numpy as np
 
 from symgraph.compile.differentiate import called
 from symgraph.compile.loops import Loop, number
+from symgraph.compile.meetings import Meetings
 from symgraph.compile.program import CALLS, Indices, Operation, Program, Value, constant_of
 from symgraph.compile.schedule import Schedule, Step
-from symgraph.compile.sharing import PARTS, Access, Costs, Meetings
+from symgraph.compile.sharing import PARTS, Costs
 
 PART = 1000  # operations of one C function: the compiler's time grows faster than a function's length
 MOST_RUNS = 12  # copies that are written out; beyond that a table says what goes where
@@ -89,7 +90,7 @@ class _FunctionWriter:
         self._shared = shared
         self._shares = writer.costs.shares(program).part if shared else None
         self._schedule = Schedule(program, lanes, self._shares)
-        self._meetings = Meetings()
+        self._meetings = Meetings(self._schedule, self._shares, writer.costs) if self._shares is not None else None
         calling = [step[0] for step in self._schedule.steps if step[0].code in (*CALLS, "external")]
         # Workspace of what is called: each part has some of its own, what they call together may have all of it.
         self._room_of_part = max((self._room(o) for o in calling if not self._together(o)), default=0)
@@ -101,12 +102,10 @@ class _FunctionWriter:
     def write(self) -> int:
         count = 0
         for i, step in enumerate(self._schedule.steps):
-            if self._shared and self._begins_level(i):
-                self._meet_before_level(i)
             begin = len(self._lines)
             self._write_step(step)
-            if self._shared:
-                self._share(step, begin)
+            if len(self._lines) > begin:
+                self._share(i, begin)
             count += len(step)
             if count >= PART:
                 self._end_part()
@@ -139,54 +138,22 @@ class _FunctionWriter:
 
     # threads
 
-    def _share(self, step: Step, begin: int) -> None:
+    def _share(self, i: int, begin: int) -> None:
         """Let the thread whose part a step is do it, whose lines begin there, or all of them together."""
-        part = self._part(step[0])
-        if len(self._lines) == begin:
+        if self._meetings is None:
             return
-        if part is None:
-            due = self._meetings.is_due
-            self._meetings.hold()  # what is called ends with a meeting
-        else:
-            due = self._meetings.needed(self._accesses(step, part))
+        due = self._meetings.before(i)
+        part = self._part(self._schedule.steps[i][0])
+        if part is not None:
             self._by_part(part, begin)
         if due:
             self._lines.insert(begin, "  meet(me);")
-
-    def _is_costly(self, i: int) -> bool:
-        return self._writer.costs.is_costly(self._schedule.steps[i][0])
-
-    def _begins_level(self, i: int) -> bool:
-        return self._is_costly(i) and not (i and self._is_costly(i - 1))
-
-    def _meet_before_level(self, i: int) -> None:
-        """Meet for what any costly step of a level needs: between them one part would wait while another one works."""
-        ahead = []
-        while i < len(self._schedule.steps) and self._is_costly(i):
-            part = self._part(self._schedule.steps[i][0])
-            ahead += [] if part is None else self._accesses(self._schedule.steps[i], part)
-            i += 1
-        if self._meetings.conflict(ahead):
-            self._meetings.hold()
-            self._lines.append("  meet(me);")
 
     def _part(self, operation: Operation) -> int | None:
         return None if self._shares is None else self._shares[operation]
 
     def _by_part(self, part: int, begin: int) -> None:
         self._lines[begin:] = [f"  if (me->parts & {1 << part}) {{", *self._lines[begin:], "  }"]
-
-    def _accesses(self, step: Step, part: int) -> list[Access]:
-        """Return what a step reads and writes."""
-        made = [output for operation in step for output in operation.outputs]
-        within = set(made)
-        read = [arg for operation in step for arg in operation.args if arg not in within]
-        return [
-            Access(self._schedule.place(value), value.size, part, writes)
-            for values, writes in ((read, False), (made, True))
-            for value in values
-            if constant_of(self._schedule.source(value)) is None
-        ]
 
     # where things are
 
@@ -395,11 +362,11 @@ class _FunctionWriter:
             if value.size:
                 each = self._each(value)
                 self._lines.append(f"  copy(res[{i}], {self._pointer(value)}, {value.size}, 1, {each});")
-        if self._shared:
+        if self._meetings is not None:
             copies = len(self._lines) > begin
             if copies:
                 self._by_part(0, begin)
-            if self._meetings.is_due:
+            if self._meetings.before_end():
                 self._lines.insert(begin, "  meet(me);")
             if copies:
                 self._lines.append("  meet(me);")
