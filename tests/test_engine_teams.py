@@ -67,14 +67,27 @@ def matrices(u, s, w, v, a, b, p):
     return ca.sumsqr(b @ (a.T @ y + (a**2) @ ca.cos(y)) @ p[0]) + ca.sumsqr(a.T**2 @ y[:, 2])
 
 
-def beside(u, s, w, v, a, b, p):
-    """Functions that are called beside each other, by other threads: some shared, some not, one of CasADi's own."""
+def long_layer(name, factor):
+    """Too long to be written out where it is called."""
     x = ca.MX.sym("x", ODD)
-    inner = [ca.Function("inner", [a_, x], [ca.tanh(a_ @ ca.sin(k * x))]) for k, a_ in ((1, WEIGHTS), (2, WEIGHTS))]
-    table = ca.interpolant("table", "bspline", [np.linspace(-9, 9, 30)], np.cos(np.linspace(-9, 9, 30)))
+    y = ca.sin(factor * x[0])
+    for k in range(35):
+        y = ca.sin(y) + 0.02 * k * y
+    return ca.Function(name, [WEIGHTS, x], [ca.tanh(WEIGHTS @ (x * y)) + ca.tanh(WEIGHTS.T @ x)])
+
+
+ONE, TWO = long_layer("one", 1), long_layer("two", 2)
+X = ca.MX.sym("x")
+TABLE = ca.Function(
+    "t", [X], [ca.interpolant("t", "bspline", [np.linspace(-9, 9, 30)], np.cos(np.linspace(-9, 9, 30)))(X)]
+)
+
+
+def beside(u, s, w, v, a, b, p):
+    """Functions that are called beside each other, and one that is CasADi's own."""
     begin = [SECOND(v, FIRST(w, u * k)) for k in (1, 2, 3, 4)]
-    each = [inner[k % 2](a, inner[k % 2](a, y)) for k, y in enumerate(begin)]
-    return ca.sumsqr(ca.vertcat(*each)) + sum(table(ca.sum1(y)) * ca.sumsqr(y) for y in begin)
+    each = [(ONE, TWO)[k % 2](a, (ONE, TWO)[k % 2](a, y)) for k, y in enumerate(begin)]
+    return ca.sumsqr(ca.vertcat(*each)) + sum(TABLE(ca.sum1(y) / ODD) * ca.sumsqr(y) for y in begin)
 
 
 CASES = {"straight": straight, "mapped": mapped, "switched": switched, "matrices": matrices, "beside": beside}
