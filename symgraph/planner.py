@@ -11,6 +11,7 @@ from typing import Any, overload
 import numpy as np
 
 from symgraph.binding import BoundModel
+from symgraph.compile.crew import cores
 from symgraph.compile.kernel import Stop
 from symgraph.constraints import counting
 from symgraph.errors import InputError, SolveError, did_you_mean, names
@@ -52,6 +53,9 @@ def solve(
     only search. While a learned model that the plan could meet has too few samples, the plan is a random one that leads
     to it, and its status begins with "exploring".
 
+    Ctrl-C ends a search early: the plan is the best that was found, its status begins with "interrupted". Where nothing
+    was found yet it is a KeyboardInterrupt.
+
     Args:
         objective: what to maximise.
         state: label → number, array or Gaussian [unit], as in `Objective.value`.
@@ -62,7 +66,7 @@ def solve(
         seed: of all that is random; the same seed gives the same plan, unless time runs out.
         time_limit: after which the best so far is returned [s]; building and compiling at first use come on top.
         threads: that share the work where J is compiled; plans are the same. More than one pays where a gradient
-            takes long, as with wide networks, and where there is a free core for each.
+            takes long, as with wide networks, and where there is a free core for each; there are never more than cores.
         progress: show a progress bar where it takes longer than two seconds.
 
     Raises:
@@ -86,7 +90,7 @@ def solve(
     with Progress("planning", progress) as bar:
         if not situation.build.has_kernel:
             bar.wait("compiling")
-        problem = _problem(objective, situation, guess, held, bar, stop, int(threads))
+        problem = _problem(objective, situation, guess, held, bar, stop, min(int(threads), cores()))
         bar.begin("planning")
         rng = np.random.default_rng(seed)
         selections = list(objective.graph.selections())

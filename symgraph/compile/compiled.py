@@ -26,6 +26,7 @@ from symgraph.slots import Array, Choices
 
 SLICE = 0.05  # seconds of a search between two looks at what the user wants
 FIRST_ROUNDS = 16  # gradients before the first one
+FIRST_POINTS = 256  # points of an evaluation before the first one
 ALIGNMENT = 64  # bytes: a cache line, and the longest vector
 SINGLE_TOLERANCE = 1e4  # times those of double precision
 MOST_SPARE = 2  # blocks of memory of one size that are kept
@@ -227,14 +228,22 @@ class _BoundCompiled(BoundKernel):
             points, chosen = points[order], chosen[order]
         inputs, stop = self._for(len(points)), self._given[3].address
         values, gradients = np.empty(len(points)), np.empty(points.shape)
-        edges = [len(points) * team // inputs.teams for team in range(inputs.teams + 1)]
-        parts = [[array[a:b] for array in (points, chosen, values, gradients)] for a, b in pairwise(edges) if b > a]
 
         def work(member: int, part: list[Array], workspace: int) -> None:
             x, h, v, g = map(address, part)
             inputs.library.code.symgraph_evaluate(member, len(part[0]), x, h, inputs.shared, stop, v, g, workspace)
 
-        inputs.crew.work(work, list(zip(parts, inputs.work, strict=False)))
+        done, count = 0, FIRST_POINTS * inputs.teams
+        while done < len(points):
+            if done and self._given[3]:
+                values[done:], gradients[done:] = np.nan, np.nan
+                break
+            begin, end = perf_counter(), min(done + count, len(points))
+            edges = [done + (end - done) * team // inputs.teams for team in range(inputs.teams + 1)]
+            parts = [[array[a:b] for array in (points, chosen, values, gradients)] for a, b in pairwise(edges) if b > a]
+            inputs.crew.work(work, list(zip(parts, inputs.work, strict=False)))
+            done = end
+            count = max(FIRST_POINTS, min(4 * count, int(count * SLICE / max(perf_counter() - begin, 1e-9))))
         if order is None:
             return values, gradients
         in_turn = np.empty_like(values), np.empty_like(gradients)

@@ -435,6 +435,7 @@ static long prepare(struct search *all, const struct lanes *lanes) {
   for (;;) { /* a point takes a place if it has the same selections as the others */
     long start = __atomic_load_n(all->next, __ATOMIC_RELAXED);
     if (all->active >= all->most || start >= all->count) break;
+    if (start > 0 && *all->set.stop) break; /* time is over: the first one alone is looked at whatever happens */
     if (all->active && memcmp(all->chosen + start * N_SELECTIONS, all->chosen + all->walks[0].start * N_SELECTIONS,
                               N_SELECTIONS * sizeof(double)))
       break;

@@ -95,7 +95,7 @@ class Shares:
             # Calls of one function, one after the other, find its weights near at hand.
             if programs and alike[programs] > ALONE * sum(costs):
                 self.part |= dict.fromkeys(group)
-                together += cost / min(self._costs.shares(program).gain for program in programs)
+                together += cost / self._costs.shares(max(programs, key=self._costs.of_program)).gain
             else:
                 chosen.append((cost, group, self._nearest(group)))
         chosen = _balanced(chosen)
@@ -193,4 +193,4 @@ class Costs:
 
     def is_shared(self, operation: Operation) -> bool:
         """Whether threads gain by sharing what is called."""
-        return operation.code in CALLS and all(map(self.is_worth_sharing, called(operation)))
+        return operation.code in CALLS and self.is_worth_sharing(max(called(operation), key=self.of_program))

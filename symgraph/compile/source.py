@@ -28,8 +28,12 @@ def kernel_source(function: ca.Function, lanes: bool, single: bool) -> list[str]
     early, late = Hoister(lanes).halves(gradient_program(function))
     writer = Writer()
     shares = {program: writer.costs.is_worth_sharing(program) for program in (early, late)}
-    early_name, early_work = writer.function(early, False, shares[early])
     late_name, late_work = writer.function(late, lanes, shares[late])
+    if shares[late] and lanes and 8 * late_work * MOST_LANES[-1] > CACHE:
+        # What parts keep to themselves would have no room in the cache, which costs more than they gain.
+        writer, shares = Writer(), dict.fromkeys(shares, False)
+        late_name, late_work = writer.function(late, lanes, False)
+    early_name, early_work = writer.function(early, False, shares[early])
     numbers = {
         "N_ACTIONS": function.nnz_in(0),
         "N_SELECTIONS": function.nnz_in(1),

@@ -40,9 +40,13 @@ VECTOR_LIBRARY = 2, 35  # of glibc, from which on libmvec has all that lanes.c c
 @cache
 def find_compiler() -> str | None:
     """Return the path of the C compiler (CC, cc, gcc or clang), or None after one warning."""
-    for name in (os.environ.get("CC", ""), "cc", "gcc", "clang"):
+    wanted = os.environ.get("CC", "")
+    for name in (wanted, "cc", "gcc", "clang"):
         path = shutil.which(name) if name else None
         if path:
+            if wanted not in ("", name):
+                text = f"CC={wanted} is no program on the PATH (options are not possible): {path} is used"
+                warnings.warn(text, stacklevel=2)
             return path
     warnings.warn(
         "no C compiler found (CC, cc, gcc, clang): plans are computed in CasADi's interpreter, several times slower; "
