@@ -160,7 +160,6 @@ def measured(kind, size):
         "compile [s]": compiled - built,
         "gradient [s/point]": min(seconds) / 16,
         "memory [MB]": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3,
-        "compiler's memory [MB]": resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e3,
     }
     print(json.dumps(result))
 
