@@ -31,10 +31,10 @@ class Weights(NamedTuple):
 def weights_of(value: Value) -> Weights:
     """Return what a left factor is made of."""
     maker = value.maker
-    squared = maker is not None and maker.code == ca.OP_SQ
-    if squared and maker is not None:
-        maker = maker.args[0].maker
-        value = value.maker.args[0]  # type: ignore[union-attr]  # it has a maker
+    squared = False
+    if maker is not None and maker.code == ca.OP_SQ:
+        squared, value = True, maker.args[0]
+        maker = value.maker
     if maker is not None and maker.code == "transpose":
         return Weights(maker.args[0], True, squared)
     return Weights(value, False, squared)

@@ -7,7 +7,7 @@ belong together. Each such group is done by one thread, by that which made what 
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterator
 
 from symgraph.compile.differentiate import called
@@ -88,9 +88,9 @@ class Shares:
         chosen: list[Share] = []
         costs = [sum(map(self._costs.of, group)) for group in groups]
         callees = [called(group[0]) if self._costs.is_shared(group[0]) else () for group in groups]
-        alike: Counter[tuple[Program, ...]] = Counter()
+        alike: dict[tuple[Program, ...], float] = defaultdict(float)
         for cost, programs in zip(costs, callees, strict=True):
-            alike[programs] += cost  # type: ignore[assignment]  # costs are no whole numbers
+            alike[programs] += cost
         for cost, group, programs in zip(costs, groups, callees, strict=True):
             # Calls of one function, one after the other, find its weights near at hand.
             if programs and alike[programs] > ALONE * sum(costs):
