@@ -18,6 +18,7 @@ from symgraph.errors import InputError, SolveError, did_you_mean, names
 from symgraph.exploration import Decisions, explore, lacking_models, met
 from symgraph.objective import Objective, check_choice, checked_column, stacked_index
 from symgraph.optimizers.constrained import Constrained
+from symgraph.optimizers.draws import generator
 from symgraph.optimizers.lbfgs import Lbfgs
 from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
 from symgraph.optimizers.settings import number, positive_whole
@@ -92,7 +93,7 @@ def solve(
             bar.wait("compiling")
         problem = _problem(objective, situation, guess, held, bar, stop, min(int(threads), cores()))
         bar.begin("planning")
-        rng = np.random.default_rng(seed)
+        rng = generator(int(seed))
         selections = list(objective.graph.selections())
         lacking = lacking_models(objective.tree, dict(zip(selections, problem.allowed, strict=True)))
         search = _explored(objective, situation, problem, selections, lacking, int(seed)) if lacking else None

@@ -9,7 +9,7 @@ import pytest
 from compiled_functions import PROCESSORS, assert_agrees, bound, compiled, expected, function_of
 
 from symgraph.compile import toolchain
-from symgraph.compile.source import _PRECISION
+from symgraph.compile.source import PRECISION
 
 MAIN = """
 #include <stdio.h>
@@ -120,7 +120,8 @@ int main(void) {
 def source(single, products=None):
     folder = resources.files("symgraph.compile")
     products = products or (folder / "products.c").read_text()
-    return "\n".join([_PRECISION[single], (folder / "lanes.c").read_text(), products, MAIN])
+    before = [(folder / name).read_text() for name in ("scalars.c", "arrays.c", "lanes.c")]
+    return "\n".join([PRECISION[single], *before, products, MAIN])
 
 
 def run(folder, flags, text):

@@ -19,35 +19,38 @@ class Hoister:
 
     Args:
         lanes: whether points are evaluated side by side.
+        kind: of what is computed once.
+        packs: whether matrices that stand left in a product are packed; else they stay where they are.
     """
 
-    def __init__(self, lanes: bool) -> None:
+    def __init__(self, lanes: bool, kind: Kind = Kind.BOUND, packs: bool = True) -> None:
         self._lanes = lanes
+        self._kind = kind
+        self._packs = packs
         self._halves: dict[Program, tuple[Program, Program]] = {}
 
     def halves(self, program: Program) -> tuple[Program, Program]:
         """Cut a program in two.
 
         Returns:
-            the inputs that are bound → a block of numbers; all inputs and that block → the outputs. Matrices that are
-            bound and stand left in a product are packed. Outputs of the second one are of lanes.
+            the inputs that are bound → a block of numbers; all inputs and that block → the outputs. Where there are
+            lanes, outputs of the second one are of lanes.
         """
         if program not in self._halves:
             self._halves[program] = self._cut(program)
         return self._halves[program]
 
     def _cut(self, program: Program) -> tuple[Program, Program]:
-        early = Program(
-            f"{program.name}_early", [Value(x.size, x.kind) for x in program.inputs if x.kind == Kind.BOUND]
-        )
+        early = Program(f"{program.name}_early", [Value(x.size, x.kind) for x in program.inputs if self._is_early(x)])
         whole = Program(program.name, [Value(x.size, x.kind) for x in program.inputs])
-        bound = [x for x in whole.inputs if x.kind == Kind.BOUND]
+        bound = [x for x in whole.inputs if self._is_early(x)]
         new = dict(zip(program.inputs, whole.inputs, strict=True))
         operations = _used(program)
         # In the reverse sweep one division serves all with the same divisor; values stay what CasADi makes of them.
-        divisions = [o for o in operations if o.code == ca.OP_DIV and o.reverse and o.outputs[0].kind > Kind.BOUND]
+        divisions = [o for o in operations if o.code == ca.OP_DIV and o.reverse and not self._is_early(o.outputs[0])]
         divisors = Counter(o.args[1] for o in divisions)
-        for group in [(operation,) for operation in operations] if self._lanes else in_pairs(operations):
+        paired = self._packs and not self._lanes
+        for group in in_pairs(operations) if paired else [(operation,) for operation in operations]:
             operation = group[0]
             whole.reversing = operation.reverse
             if len(group) > 1:
@@ -58,15 +61,15 @@ class Hoister:
                 new[operation.outputs[0]] = whole.elementwise(ca.OP_MUL, x, inverse)
             else:
                 self._rewrite(whole, operation, new)
-        outputs = [_of_lanes(whole, new[value]) for value in program.outputs]
+        outputs = [self._of_lanes(whole, new[value]) for value in program.outputs]
 
         wanted = dict.fromkeys(
             value
-            for values in (outputs, *(o.args for o in whole.operations if o.outputs[0].kind > Kind.BOUND))
+            for values in (outputs, *(o.args for o in whole.operations if not self._is_early(o.outputs[0])))
             for value in values
-            if value.kind == Kind.BOUND and not _is_free(value)
+            if self._is_early(value) and not _is_free(value)
         )
-        block = Value(sum(value.size for value in wanted), Kind.BOUND)
+        block = Value(sum(value.size for value in wanted), self._kind)
         late = Program(program.name, [*(Value(x.size, x.kind) for x in whole.inputs), block])
         before = dict(zip(bound, early.inputs, strict=True))
         after = dict(zip(whole.inputs, late.inputs, strict=False))
@@ -75,7 +78,7 @@ class Hoister:
             after[value] = late.gather([block], begin + np.arange(value.size))
             begin += value.size
         for operation in whole.operations:
-            if operation.outputs[0].kind == Kind.BOUND:
+            if self._is_early(operation.outputs[0]):
                 copied(early, operation, before)
                 if _is_free(operation.outputs[0]) and all(arg in after for arg in operation.args):
                     copied(late, operation, after)
@@ -85,16 +88,32 @@ class Hoister:
         late.outputs = tuple(after[value] for value in outputs)
         return _pruned(early), _pruned(late)
 
+    def _is_early(self, value: Value) -> bool:
+        return value.kind <= self._kind
+
+    def _of_lanes(self, program: Program, value: Value) -> Value:
+        """Return the same numbers, for each point."""
+        if not self._lanes or not self._is_early(value):
+            return value
+        (spread,) = program.add("spread", (value,), None, [value.size])
+        spread.kind = Kind.BLOCK
+        return spread
+
     def _rewrite(self, whole: Program, operation: Operation, new: dict[Value, Value]) -> None:
         if operation.code == "ruled":  # it has served
             new.update(zip(operation.outputs, (new[arg] for arg in operation.args), strict=False))
-        elif operation.outputs[0].kind == Kind.BOUND:
+        elif self._is_early(operation.outputs[0]):
             copied(whole, operation, new)
         elif operation.code in CALLS:
             self._rewrite_call(whole, operation, new)
-        elif operation.code == "product" and new[operation.args[0]].kind == Kind.BOUND:
+        elif operation.code == "product" and self._is_early(new[operation.args[0]]):
             left, right = (new[arg] for arg in operation.args)
             m, k, n = operation.detail
+            if not self._packs:
+                matrix, transposed, squares = weights_of(left)
+                shape = m, k, n, transposed, squares
+                new[operation.outputs[0]] = whole.add("weighted product", (matrix, right), shape, [m * n], shape)[0]
+                return
             # A point alone is bound by how fast weights can be read: squares are better made anew.
             packed, squared = self._packed(whole, left, m, k, keep_squares=self._lanes)
             detail = m, k, n, squared
@@ -130,29 +149,20 @@ class Hoister:
         halves = [self.halves(program) for program in programs]
         blocks = []
         for program, (early, _) in zip(programs, halves, strict=True):
-            given = tuple(arg for arg, x in zip(args[first:], program.inputs, strict=True) if x.kind == Kind.BOUND)
+            given = tuple(arg for arg, x in zip(args[first:], program.inputs, strict=True) if self._is_early(x))
             size = early.outputs[0].size * times
             code, detail = ("repeat", (early, times)) if operation.code == "repeat" else ("call", early)
             blocks.append(whole.add(code, given, detail, [size], detail)[0] if size else whole.constant(np.zeros(0)))
         args[first:] = [
-            arg if x.kind == Kind.BOUND else _of_lanes(whole, arg)
+            arg if self._is_early(x) else self._of_lanes(whole, arg)
             for arg, x in zip(args[first:], programs[0].inputs, strict=True)
         ]
         if first:
-            args[0] = _of_lanes(whole, args[0])
+            args[0] = self._of_lanes(whole, args[0])
         detail = recalled(operation, [late for _, late in halves])
         sizes = [output.size for output in operation.outputs]
         made = whole.add(operation.code, (*args, *blocks), detail, sizes, detail)
         new.update(zip(operation.outputs, made, strict=True))
-
-
-def _of_lanes(program: Program, value: Value) -> Value:
-    """Return the same numbers, for each point."""
-    if value.kind > Kind.BOUND:
-        return value
-    (spread,) = program.add("spread", (value,), None, [value.size])
-    spread.kind = Kind.BLOCK
-    return spread
 
 
 def _is_free(value: Value) -> bool:

@@ -1,9 +1,6 @@
-/* Numbers side by side: vectors of the processor, and arrays with a number for each of B lanes.
+/* Numbers side by side in vectors of the processor: GNU C's, which gcc and clang know. Before this file stands scalars.c.
 
-   GNU C's vectors, which gcc and clang know. Strict arithmetic: NaN and infinity come out as from the C library. */
-#include <math.h>
-#include <string.h>
-
+   Strict arithmetic: NaN and infinity come out as from the C library. */
 #ifdef __AVX512F__
 #define BYTES 64
 #elif defined(__AVX__)
@@ -38,52 +35,11 @@ static inline void store_some(real *p, vec x, long left) {
     memcpy(p, &x, (size_t) left * sizeof(real));
 }
 
-/* Scalars. */
-static inline real s_fmax(real x, real y) { return x > y || y != y ? x : y; } /* NaN gives way to a number */
-static inline real s_fmin(real x, real y) { return x < y || y != y ? x : y; }
-static inline real s_sign(real x) { return x > 0 ? 1 : x < 0 ? -1 : x; }
-static inline real s_lt(real x, real y) { return x < y; }
-static inline real s_le(real x, real y) { return x <= y; }
-static inline real s_eq(real x, real y) { return x == y; }
-static inline real s_ne(real x, real y) { return x != y; }
-static inline real s_not(real x) { return x == 0; }
-static inline real s_and(real x, real y) { return x != 0 && y != 0; }
-static inline real s_or(real x, real y) { return x != 0 || y != 0; }
-static inline real s_if_else_zero(real x, real y) { return x != 0 ? y : 0; }
-static inline real s_step(real x, real y) { return x > y ? 1 : x < y ? 0 : x == y ? (real) 0.5 : (real) NAN; }
-
-/* The inverse of the error function: Winitzki's approximation, made exact by Newton's and Halley's steps. */
-static real s_erfinv(real x) {
-  double y, a, b;
-  int i;
-  if (!(fabs((double) x) < 1)) return x == 1 ? (real) INFINITY : x == -1 ? (real) -INFINITY : (real) NAN;
-  a = log1p(-(double) x * (double) x);
-  b = 4.330746750799873 + a / 2;
-  y = copysign(sqrt(sqrt(b * b - a / 0.147) - b), (double) x);
-  for (i = 0; i < 3; ++i) {
-    double error = (x < 0 ? erfc(-y) - (1 + (double) x) : (1 - (double) x) - erfc(y)), slope = 1.1283791670955126 * exp(-y * y);
-    double step = error / slope;
-    y -= step / (1 + y * step);
-  }
-  return (real) y;
-}
-
-#define SCALAR_1(name) \
-  static inline real s_##name(real x) { return MATH(name)(x); }
-#define SCALAR_2(name) \
-  static inline real s_##name(real x, real y) { return MATH(name)(x, y); }
+/* Number by number, or by the C library's vector functions where it has them. */
 #define FUNCTIONS_1(DO) \
   DO(exp) DO(log) DO(sin) DO(cos) DO(tan) DO(asin) DO(acos) DO(atan) DO(sinh) DO(cosh) DO(tanh) DO(asinh) DO(acosh) \
   DO(atanh) DO(erf) DO(log1p) DO(expm1)
 #define FUNCTIONS_2(DO) DO(pow) DO(atan2) DO(hypot)
-#define OTHERS_1(DO) DO(sqrt) DO(floor) DO(ceil) DO(fabs)
-#define OTHERS_2(DO) DO(fmod) DO(remainder) DO(copysign)
-FUNCTIONS_1(SCALAR_1)
-FUNCTIONS_2(SCALAR_2)
-OTHERS_1(SCALAR_1)
-OTHERS_2(SCALAR_2)
-
-/* Vectors: number by number, or by the C library's vector functions where it has them. */
 #define EACH_1(name) \
   static vec v_##name(vec x) { \
     vec y; \
@@ -135,7 +91,9 @@ EACH_1(erfinv)
 EACH_1(floor)
 EACH_1(ceil)
 EACH_1(sign)
-OTHERS_2(EACH_2)
+EACH_2(fmod)
+EACH_2(remainder)
+EACH_2(copysign)
 #if defined(__AVX512F__) && !defined(SINGLE)
 static inline vec v_sqrt(vec x) { return (vec) _mm512_sqrt_pd((__m512d) x); }
 #elif defined(__AVX512F__)
@@ -163,65 +121,4 @@ static inline vec v_or(vec x, vec y) { return one_where((x != 0) | (y != 0)); }
 static inline vec v_if_else_zero(vec x, vec y) { return (vec) ((x != 0) & (mask) y); }
 static inline vec v_step(vec x, vec y) {
   return pick(x > y, all(1), pick(x < y, all(0), pick(x == y, all((real) 0.5), all((real) NAN))));
-}
-
-/* Arrays whose numbers are rows of B lanes; B = 1 for plain ones. */
-static inline void zero(real *z, long count) { memset(z, 0, (size_t) count * sizeof(real)); }
-static void copy(real *z, const real *x, long count, long step, long B) {
-  long i;
-  if (step == 1)
-    memcpy(z, x, (size_t) (count * B) * sizeof(real));
-  else if (B == 1)
-    for (i = 0; i < count; ++i) z[i] = x[i * step];
-  else
-    for (i = 0; i < count; ++i) memcpy(z + i * B, x + i * step * B, (size_t) B * sizeof(real));
-}
-static void spread(real *z, const real *x, long count, long step, long B) {
-  long i, l;
-  for (i = 0; i < count; ++i)
-    for (l = 0; l < B; ++l) z[i * B + l] = x[i * step];
-}
-/* Tables hold pairs (place in z, place in x). */
-static void copy_some(real *z, const real *x, const int *table, long count, long B) {
-  long i;
-  for (i = 0; i < count; ++i, table += 2) memcpy(z + table[0] * B, x + table[1] * B, (size_t) B * sizeof(real));
-}
-static void spread_some(real *z, const real *x, const int *table, long count, long B) {
-  long i, l;
-  for (i = 0; i < count; ++i, table += 2)
-    for (l = 0; l < B; ++l) z[table[0] * B + l] = x[table[1]];
-}
-static void transpose(real *z, const real *x, long rows, long columns, long B) {
-  long i, j, l;
-  for (i = 0; i < rows; ++i)
-    for (j = 0; j < columns; ++j)
-      for (l = 0; l < B; ++l) z[(j + i * columns) * B + l] = x[(i + j * rows) * B + l];
-}
-/* z[t] += x[i], with a table of (t, i); xw numbers of x for each of its own, B or 1. */
-static void add_some(real *z, const int *table, long count, const real *x, long xw, long B) {
-  long n, l;
-  for (n = 0; n < count; ++n, table += 2)
-    for (l = 0; l < B; ++l) z[table[0] * B + l] += x[table[1] * xw + (xw > 1 ? l : 0)];
-}
-/* z[t] += x[i] y[j], with a table of (t, i, j). */
-static void add_products(real *z, const int *table, long count, const real *x, long xw, const real *y, long yw, long B) {
-  long n, l;
-  for (n = 0; n < count; ++n, table += 3) {
-    const real *const p = x + table[1] * xw, *const q = y + table[2] * yw;
-    real *const r = z + table[0] * B;
-    if (xw == B && yw == B)
-      for (l = 0; l < B; ++l) r[l] += p[l] * q[l];
-    else
-      for (l = 0; l < B; ++l) r[l] += p[xw > 1 ? l : 0] * q[yw > 1 ? l : 0];
-  }
-}
-/* One lane for CasADi's own code, and back, in doubles that begin where one may. */
-static inline double *doubles(real *w) { return (double *) (((size_t) w + sizeof(double) - 1) / sizeof(double) * sizeof(double)); }
-static inline void take(const real *x, long xw, long lane, double *z, long count) {
-  long i;
-  for (i = 0; i < count; ++i) z[i] = (double) x[i * xw + (xw > 1 ? lane : 0)];
-}
-static inline void put(real *z, long zw, long lane, const double *x, long count, int failed) {
-  long i;
-  for (i = 0; i < count; ++i) z[i * zw + (zw > 1 ? lane : 0)] = failed ? (real) NAN : (real) x[i];
 }

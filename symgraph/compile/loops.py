@@ -29,17 +29,21 @@ class Loop:
         pointer: C for where a value begins.
         size: of the arrays.
         lanes: whether there are lanes.
+        plain: in standard C, number by number; else with vectors of the processor.
     """
 
-    def __init__(self, schedule: Schedule, pointer: Callable[[Value], str], size: int, lanes: bool) -> None:
+    def __init__(
+        self, schedule: Schedule, pointer: Callable[[Value], str], size: int, lanes: bool, plain: bool
+    ) -> None:
         self._schedule = schedule
         self._pointer = pointer
         self._size = size
         self._lanes = lanes
-        self._vector = lanes or size > 1
+        self._plain = plain
+        self._vector = not plain and (lanes or size > 1)
         self._names: dict[Value, str] = {}
         self._body: list[str] = []
-        self._plain = True  # all arrays in step, element by element and lane by lane
+        self._in_step = True  # all arrays in step, element by element and lane by lane
 
     def add(self, operation: Operation) -> None:
         args = [self._read(arg) for arg in operation.args]
@@ -59,17 +63,17 @@ class Loop:
             return self._names[root]
         numbers = constant_of(value)
         if numbers is not None and numbers.size == 1:
-            text = f"all({number(numbers[0])})" if self._vector else number(numbers[0])
+            text = f"all({number(numbers[0])})" if self._vector else f"(real) {number(numbers[0])}"
         else:
             pointer, single, wide = self._pointer(value), value.size < self._size, self._schedule.is_wide(value)
             if not self._vector:
-                text = f"*({pointer})"
+                text = f"*({pointer})" if single or self._size == 1 else f"({pointer})[i]"
             elif self._lanes and wide:
                 text = f"load({pointer} + {'l' if single and self._size > 1 else 'i'})"
-                self._plain = self._plain and not (single and self._size > 1)
+                self._in_step = self._in_step and not (single and self._size > 1)
             elif self._lanes:
                 text = f"all(({pointer})[{'0' if single or self._size == 1 else 'e'}])"
-                self._plain = self._plain and (single or self._size == 1)
+                self._in_step = self._in_step and (single or self._size == 1)
             elif single:
                 text = f"all(*({pointer}))"
             else:
@@ -84,16 +88,22 @@ class Loop:
         for value in stored:
             pointer, name = self._pointer(value), self._names[value]
             if not self._vector:
-                self._body.append(f"*({pointer}) = {name};")
+                self._body.append(f"({pointer})[i] = {name};" if self._size > 1 else f"*({pointer}) = {name};")
             elif self._lanes:
                 self._body.append(f"store({pointer} + i, {name});")
             else:
                 self._body.append(f"store_some({pointer} + i, {name}, {self._size} - i);")
+        if not self._vector and self._size > 1:
+            return [
+                f"  {{ long i; for (i = 0; i < {self._size}; ++i) {{",
+                *(f"    {line}" for line in self._body),
+                "  } }",
+            ]
         if not self._vector:
             head = ["  {"]
         elif not self._lanes:
             head = [f"  {{ long i; for (i = 0; i < {self._size}; i += VL) {{"]
-        elif self._plain:
+        elif self._in_step:
             head = [f"  {{ long i; for (i = 0; i < {self._size} * B; i += VL) {{"]
         else:
             loops = f"for (e = 0; e < {self._size}; ++e) for (l = 0; l < B; l += VL) {{"

@@ -21,9 +21,10 @@ Indices = npt.NDArray[np.int64]
 class Kind(IntEnum):
     """What a value follows from."""
 
-    BOUND = 0  # parameters and the start state alone: the same in all gradients of a search
-    BLOCK = 1  # selections too: the same at all points that are evaluated side by side
-    LANE = 2  # actions: another one at each point
+    WEIGHT = 0  # constants and parameters alone: the same until a model is fitted anew
+    BOUND = 1  # the start state too: the same in all gradients of a search
+    BLOCK = 2  # selections too: the same at all points that are evaluated side by side
+    LANE = 3  # actions: another one at each point
 
 
 class Value:
@@ -52,6 +53,8 @@ class Operation:
     call        another program; detail: it
     switch      one of several programs, by the first argument; detail: they, the last one for all other numbers.
                 Arguments and outputs may be longer than those of a program, which uses their beginnings
+    weighted product  matrices that stand as they are, perhaps to be transposed or squared first, with others; detail:
+                (m, k, n, transposed, squared)
     repeat      a program for consecutive parts of the arguments; detail: (program, times)
     external    a CasADi function that has no program; detail: it
     """
@@ -93,7 +96,7 @@ class Program:
         known = (code, key, args)
         operation = self._known.get(known)
         if operation is None:
-            kind = max((arg.kind for arg in args), default=Kind.BOUND)
+            kind = max((arg.kind for arg in args), default=Kind.WEIGHT)
             operation = Operation(code, args, detail, sizes, kind)
             operation.reverse = self.reversing
             self.operations.append(operation)

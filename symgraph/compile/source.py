@@ -44,12 +44,12 @@ def kernel_source(function: ca.Function, lanes: bool, single: bool) -> list[str]
         "LATE_WORK": late_work,
         "SHARED": int(shares[late]),
     }
-    head = [_PRECISION[single], *map(_text, ("lanes.c", "products.c", "team.c"))]
+    head = [PRECISION[single], *map(text_of, ("scalars.c", "arrays.c", "lanes.c", "products.c", "team.c"))]
     tail = [
         _entry("early", early_name, shares[early]),
         _entry("late", late_name, shares[late]),
         *(f"#define {name} {value}" for name, value in numbers.items()),
-        *map(_text, ("search.c", "kernel.c")),
+        *map(text_of, ("walks.c", "search.c", "kernel.c")),
     ]
     casadi = writer.casadi()
     if casadi:  # its functions are in one piece
@@ -75,12 +75,12 @@ def gradient_program(function: ca.Function) -> Program:
     return Differentiator().with_gradient(Reader(function).program(kinds), by=0)
 
 
-_PRECISION = {
+PRECISION = {
     False: "typedef double real;\ntypedef long long whole;\n#define MATH(name) name",
     True: "typedef float real;\ntypedef int whole;\n#define MATH(name) name##f\n#define SINGLE",
 }
 
 
-def _text(name: str) -> str:
+def text_of(name: str) -> str:
     """Return a C file of this package."""
     return (resources.files("symgraph.compile") / name).read_text()

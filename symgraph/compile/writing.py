@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from itertools import islice
 
@@ -25,9 +26,13 @@ class Writer:
     A function takes its inputs, its outputs, workspace and the number of lanes. With lanes, a number that is not bound
     is a row of as many numbers, one for each; the function does the same to all of them. A function that several
     threads share also takes the member of their team that calls it; when it returns all of them have done all of it.
+
+    Args:
+        plain: write standard C99 that is C++ too, for one point at a time; else for vectors of the processor.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, plain: bool = False) -> None:
+        self.plain = plain
         self.costs = Costs()
         self._functions: dict[tuple[Program, bool, bool], tuple[str, int]] = {}
         self._tables: dict[tuple[str, bytes], str] = {}
@@ -42,6 +47,21 @@ class Writer:
             self._functions[key] = name, 0  # the name is taken while those that it calls are written
             self._functions[key] = name, _FunctionWriter(self, program, lanes, shared, name).write()
         return self._functions[key]
+
+    def given(self, shared: bool) -> str:
+        """Return what a function hands on to a part of itself."""
+        return f"arg, res, w{'' if self.plain else ', B'}{', me' * shared}"
+
+    def defined(self, name: str, shared: bool, lines: Sequence[str]) -> None:
+        """Add a function with the arguments that all have."""
+        body = "\n".join(lines)
+        if self.plain:
+            head = f"static void {name}(const real *const *arg, real *const *res, real *w)"
+            unused = [f"  (void) {arg};" for arg in ("arg", "res", "w") if not re.search(rf"\b{arg}\b", body)]
+            body = "\n".join([body, *unused])
+        else:
+            head = f"static void {name}{signature(shared)}"
+        self.add(f"{head} {{\n{body}\n}}")
 
     @property
     def pieces(self) -> list[str]:
@@ -112,8 +132,8 @@ class _FunctionWriter:
                 count = 0
         self._write_outputs()
         self._end_part()
-        calls = "\n".join(f"  {part}(arg, res, w, B{', me' * self._shared});" for part in self._parts)
-        self._writer.add(f"static void {self._name}{signature(self._shared)} {{\n{calls}\n}}")
+        given = self._writer.given(self._shared)
+        self._writer.defined(self._name, self._shared, [f"  {part}({given});" for part in self._parts])
         return self._schedule.work + self._below
 
     def _room(self, operation: Operation) -> int:
@@ -132,7 +152,7 @@ class _FunctionWriter:
     def _end_part(self) -> None:
         if self._lines:
             name = f"{self._name}_{len(self._parts)}"
-            self._writer.add(f"static void {name}{signature(self._shared)} {{\n" + "\n".join(self._lines) + "\n}")
+            self._writer.defined(name, self._shared, self._lines)
             self._parts.append(name)
             self._lines = []
 
@@ -185,7 +205,7 @@ class _FunctionWriter:
 
     def _write_loop(self, step: Step) -> None:
         size = step[0].outputs[0].size
-        loop = Loop(self._schedule, self._pointer, size, self._lanes)
+        loop = Loop(self._schedule, self._pointer, size, self._lanes, self._writer.plain)
         for operation in step:
             loop.add(operation)
         stored = [o.outputs[0] for o in step if self._schedule.is_used_later(o.outputs[0], step)]
@@ -261,6 +281,12 @@ class _FunctionWriter:
         do = "multiply_packed_lanes" if self._lanes else ("multiply_squares" if squared else "multiply_packed")
         self._lines.append(f"  {do}({pointers}, {m}, {k}, {n}{', B' if self._lanes else ''});")
 
+    def _write_weighted_product(self, operation: Operation) -> None:
+        m, k, n, transposed, squared = operation.detail
+        pointers = ", ".join(map(self._pointer, (*operation.args, *operation.outputs)))
+        do = ("multiply", "multiply_transposed")[transposed] + "_squares" * squared
+        self._lines.append(f"  {do}({pointers}, {m}, {k}, {n});")
+
     def _write_packed_pair(self, operation: Operation) -> None:
         pointers = ", ".join(map(self._pointer, (*operation.args, *operation.outputs)))
         self._lines.append(f"  multiply_pair({pointers}, {', '.join(map(str, operation.detail))});")
@@ -286,7 +312,7 @@ class _FunctionWriter:
         return [
             f"{indent}{{ const real *const x[] = {{{given}}};",
             f"{indent}  real *const y[] = {{{made}}};",
-            f"{indent}  {name}(x, y, {self._free(caller)}, B{', me' * shared}); }}",
+            f"{indent}  {name}(x, y, {self._free(caller)}{'' if self._writer.plain else ', B'}{', me' * shared}); }}",
         ]
 
     def _together(self, operation: Operation) -> bool:

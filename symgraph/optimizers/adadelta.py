@@ -8,6 +8,7 @@ import numpy as np
 
 from symgraph.compile.kernel import AdadeltaSteps, BoundKernel
 from symgraph.errors import InputError
+from symgraph.optimizers.draws import below, normal
 from symgraph.optimizers.problem import Optimizer, Problem, Run, Search, best_of
 from symgraph.optimizers.settings import number, positive_whole
 from symgraph.optimizers.starts import climbed, promising_points, status_of
@@ -220,9 +221,9 @@ class _Queue:
             return self.waiting.pop(int(np.argmax([run.value for run in self.waiting])))
         best = best_of(finished)
         if draw < 0.7 or best is None:
-            return self.waiting.pop(int(self._rng.integers(len(self.waiting))))
+            return self.waiting.pop(below(self._rng, len(self.waiting)))
         self.waiting.pop(int(np.argmin([run.value for run in self.waiting])))
         low, high = self._problem.low, self._problem.high
-        noise = 0.001 * (high - low) * self._rng.standard_normal(self._problem.n)
+        noise = 0.001 * (high - low) * normal(self._rng, self._problem.n)
         point = np.clip(best.point + noise, low, high)
         return Run(point, point, best.choices, -np.inf, "iteration limit", np.zeros(0))

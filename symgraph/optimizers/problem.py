@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from symgraph.compile.kernel import NEVER, BoundKernel, Ended, Outcome, Stop
 from symgraph.optimizers.constrained import Constrained
+from symgraph.optimizers.draws import distinct, generator, latin_hypercubes, normal
 from symgraph.progress import Progress
 from symgraph.situation import Situation
 from symgraph.slots import Array, Choices
@@ -119,7 +120,7 @@ class Problem:
     def know(self, choice: Choices) -> None:
         """Find out the units of requirements under choices (s,)."""
         if self.constrained is not None and not self.constrained.knows(choice):
-            points = self.draw_points(np.random.default_rng(0), SCALE_SAMPLES, "spread")
+            points = self.draw_points(generator(0), SCALE_SAMPLES, "spread")
             hot = np.tile(self.one_hot(choice[None]), (SCALE_SAMPLES, 1))
             self.constrained.learn(choice, self.constrained.margins(points, hot))
 
@@ -145,7 +146,7 @@ class Problem:
         taken for each combination of selections, since those may differ by far more than the actions can change.
         """
         if choice.tobytes() not in self._scales:
-            points = self.draw_points(np.random.default_rng(0), SCALE_SAMPLES, "spread")
+            points = self.draw_points(generator(0), SCALE_SAMPLES, "spread")
             self.remember_scale(choice, self.values(points, np.tile(choice, (SCALE_SAMPLES, 1))))
         return self._scales.setdefault(choice.tobytes(), 1.0)
 
@@ -162,10 +163,12 @@ class Problem:
     def draw_choices(self, rng: np.random.Generator, count: int, evenly: bool) -> Choices:
         """Draw choices (count, s): evenly over the combinations, or independently and uniformly."""
         if not evenly or self.combinations > 10**9:
-            columns = [rng.choice(choices, size=count) for choices in self.allowed]
+            sizes = np.array([len(choices) for choices in self.allowed], dtype=np.int64)
+            places = (rng.random((count, len(sizes))) * sizes).astype(np.int64)
+            columns = [np.asarray(choices)[places[:, s]] for s, choices in enumerate(self.allowed)]
             return np.array(columns, dtype=np.int64).reshape(len(self.allowed), count).T
         repeats, rest = divmod(count, self.combinations)
-        partial = rng.choice(self.combinations, size=rest, replace=False) if rest else np.zeros(0, dtype=np.int64)
+        partial = distinct(rng, self.combinations, rest)
         codes = np.concatenate([np.tile(np.arange(self.combinations), repeats), partial]) if repeats else partial
         return self.decode(codes)
 
@@ -184,19 +187,17 @@ class Problem:
             rng: source of randomness.
             count: how many in a block.
             sampling: "uniform"; "gaussian", around the middle with a quarter of the range as standard deviation,
-                clipped; or "spread", each block a Latin hypercube (McKay, Beckman & Conover 1979).
+                clipped; or "spread", each block a Latin hypercube.
             blocks: how many blocks, one after the other.
         """
         span = self.high - self.low
         shape = (blocks, count, self.n)
         if sampling == "gaussian":
-            points = (self.low + self.high) / 2 + span / 4 * rng.standard_normal(shape)
+            points = (self.low + self.high) / 2 + span / 4 * normal(rng, math.prod(shape)).reshape(shape)
+        elif sampling == "spread":
+            points = self.low + span * latin_hypercubes(rng, blocks, count, self.n)
         else:
-            unit = rng.random(shape)
-            if sampling == "spread":
-                ranks = np.broadcast_to(np.arange(count)[None, :, None], shape)
-                unit = (rng.permuted(ranks, axis=1) + unit) / count
-            points = self.low + span * unit
+            points = self.low + span * rng.random(shape)
         return np.clip(points, self.low, self.high).reshape(blocks * count, self.n)
 
     def started_from_guesses(self, rng: np.random.Generator) -> tuple[Array, Choices]:
