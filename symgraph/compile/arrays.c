@@ -9,7 +9,7 @@ static void copy(real *z, const real *x, long count, long step, long B) {
   else
     for (i = 0; i < count; ++i) memcpy(z + i * B, x + i * step * B, (size_t) B * sizeof(real));
 }
-static void spread(real *z, const real *x, long count, long step, long B) {
+static void widen(real *z, const real *x, long count, long step, long B) {
   long i, l;
   for (i = 0; i < count; ++i)
     for (l = 0; l < B; ++l) z[i * B + l] = x[i * step];
@@ -19,7 +19,7 @@ static void copy_some(real *z, const real *x, const int *table, long count, long
   long i;
   for (i = 0; i < count; ++i, table += 2) memcpy(z + table[0] * B, x + table[1] * B, (size_t) B * sizeof(real));
 }
-static void spread_some(real *z, const real *x, const int *table, long count, long B) {
+static void widen_some(real *z, const real *x, const int *table, long count, long B) {
   long i, l;
   for (i = 0; i < count; ++i, table += 2)
     for (l = 0; l < B; ++l) z[table[0] * B + l] = x[table[1]];

@@ -33,6 +33,22 @@ class Differentiator:
         target.outputs = (*results, sweep.adjoint(target.inputs[by]))
         return target
 
+    def with_weighted_gradient(self, program: Program, by: int) -> Program:
+        """Return the program with one more input, a weight for each number of its second output, and one more output.
+
+        This is the gradient, by an input, of the first output, a number, plus the weighted sum of the second one. Numbers
+        of weight 0 have no part in it, even if their slopes are not finite.
+        """
+        inputs = [Value(x.size, x.kind) for x in program.inputs]
+        weights = Value(program.outputs[1].size, Kind.BLOCK)
+        target = Program(program.name, [*inputs, weights])
+        sweep = _Sweep(self, target, inputs)
+        results = sweep.forward(program)
+        sweep.guard(results[1:])
+        sweep.reverse([(results[0], target.constant(1.0)), (results[1], weights)])
+        target.outputs = (*results, sweep.adjoint(inputs[by]))
+        return target
+
     def pair(self, program: Program) -> tuple[Program, Program]:
         """Cut a program in two for its derivative.
 
@@ -148,6 +164,18 @@ def called(operation: Operation) -> tuple[Program, ...]:
     if operation.code == "switch":
         return tuple(operation.detail)
     return (operation.detail if operation.code == "call" else operation.detail[0],)
+
+
+def handed(operation: Operation) -> list[tuple[Value, ...]]:
+    """Return the arguments that each of the called programs gets.
+
+    A switch has its index first; then those for all programs; then, once or several times, one for each of them.
+    """
+    programs = called(operation)
+    args = operation.args[operation.code == "switch" :]
+    own = (len(args) - len(programs[0].inputs)) // (len(programs) - 1) if len(programs) > 1 else 0
+    common = len(programs[0].inputs) - own
+    return [(*args[:common], *args[common + i :: len(programs)]) for i in range(len(programs))]
 
 
 def recalled(operation: Operation, programs: Sequence[Program]) -> Any:

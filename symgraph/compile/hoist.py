@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 
 import casadi as ca
 import numpy as np
 
-from symgraph.compile.differentiate import called, copied, recalled
+from symgraph.compile.differentiate import called, copied, handed, recalled
 from symgraph.compile.pairing import Group, in_pairs, weights_of
 from symgraph.compile.program import CALLS, Indices, Kind, Operation, Program, Value, constant_of
 
@@ -45,7 +46,7 @@ class Hoister:
         whole = Program(program.name, [Value(x.size, x.kind) for x in program.inputs])
         bound = [x for x in whole.inputs if self._is_early(x)]
         new = dict(zip(program.inputs, whole.inputs, strict=True))
-        operations = _used(program)
+        operations = used(program.operations, program.outputs)
         # In the reverse sweep one division serves all with the same divisor; values stay what CasADi makes of them.
         divisions = [o for o in operations if o.code == ca.OP_DIV and o.reverse and not self._is_early(o.outputs[0])]
         divisors = Counter(o.args[1] for o in divisions)
@@ -67,7 +68,7 @@ class Hoister:
             value
             for values in (outputs, *(o.args for o in whole.operations if not self._is_early(o.outputs[0])))
             for value in values
-            if self._is_early(value) and not _is_free(value)
+            if self._is_early(value) and not is_free(value)
         )
         block = Value(sum(value.size for value in wanted), self._kind)
         late = Program(program.name, [*(Value(x.size, x.kind) for x in whole.inputs), block])
@@ -80,7 +81,7 @@ class Hoister:
         for operation in whole.operations:
             if self._is_early(operation.outputs[0]):
                 copied(early, operation, before)
-                if _is_free(operation.outputs[0]) and all(arg in after for arg in operation.args):
+                if is_free(operation.outputs[0]) and all(arg in after for arg in operation.args):
                     copied(late, operation, after)
             else:
                 copied(late, operation, after)
@@ -148,29 +149,30 @@ class Hoister:
         programs = called(operation)
         halves = [self.halves(program) for program in programs]
         blocks = []
-        for program, (early, _) in zip(programs, halves, strict=True):
-            given = tuple(arg for arg, x in zip(args[first:], program.inputs, strict=True) if self._is_early(x))
+        for program, own, (early, _) in zip(programs, handed(operation), halves, strict=True):
+            given = tuple(new[arg] for arg, x in zip(own, program.inputs, strict=True) if self._is_early(x))
             size = early.outputs[0].size * times
             code, detail = ("repeat", (early, times)) if operation.code == "repeat" else ("call", early)
             blocks.append(whole.add(code, given, detail, [size], detail)[0] if size else whole.constant(np.zeros(0)))
-        args[first:] = [
-            arg if self._is_early(x) else self._of_lanes(whole, arg)
-            for arg, x in zip(args[first:], programs[0].inputs, strict=True)
-        ]
-        if first:
-            args[0] = self._of_lanes(whole, args[0])
+        if self._lanes:
+            kinds = [program_input.kind for program_input in programs[0].inputs]
+            args[first:] = [
+                arg if kind <= self._kind else self._of_lanes(whole, arg)
+                for arg, kind in zip(args[first:], kinds, strict=True)
+            ]
+            args[:first] = [self._of_lanes(whole, arg) for arg in args[:first]]
         detail = recalled(operation, [late for _, late in halves])
         sizes = [output.size for output in operation.outputs]
         made = whole.add(operation.code, (*args, *blocks), detail, sizes, detail)
         new.update(zip(operation.outputs, made, strict=True))
 
 
-def _is_free(value: Value) -> bool:
+def is_free(value: Value) -> bool:
     """Whether a bound value costs nothing: an input, a constant, or consecutive numbers of such a one."""
     maker = value.maker
     if maker is None or constant_of(value) is not None:
         return True
-    return maker.code == "gather" and len(maker.args) == 1 and is_run(maker.detail) and _is_free(maker.args[0])
+    return maker.code == "gather" and len(maker.args) == 1 and is_run(maker.detail) and is_free(maker.args[0])
 
 
 def is_run(indices: Indices) -> bool:
@@ -178,18 +180,18 @@ def is_run(indices: Indices) -> bool:
     return bool(indices.size and indices[0] >= 0 and (indices == indices[0] + np.arange(indices.size)).all())
 
 
-def _used(program: Program) -> list[Operation]:
+def used(operations: Iterable[Operation], outputs: Iterable[Value]) -> list[Operation]:
     """Return the operations that outputs follow from, in order."""
     found: set[Operation] = set()
-    waiting = [value.maker for value in program.outputs]
+    waiting = [value.maker for value in outputs]
     while waiting:
         operation = waiting.pop()
         if operation is not None and operation not in found:
             found.add(operation)
             waiting += [arg.maker for arg in operation.args]
-    return [operation for operation in program.operations if operation in found]
+    return [operation for operation in operations if operation in found]
 
 
 def _pruned(program: Program) -> Program:
-    program.operations = _used(program)
+    program.operations = used(program.operations, program.outputs)
     return program

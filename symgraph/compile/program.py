@@ -52,7 +52,8 @@ class Operation:
     accumulate  y[t] += a[i] b[j], or y[t] += a[i] with one argument; detail: (t, i, j)
     call        another program; detail: it
     switch      one of several programs, by the first argument; detail: they, the last one for all other numbers.
-                Arguments and outputs may be longer than those of a program, which uses their beginnings
+                Arguments and outputs may be longer than those of a program, which uses their beginnings. Behind
+                arguments for all programs may stand some that each has of its own: see `handed`
     weighted product  matrices that stand as they are, perhaps to be transposed or squared first, with others; detail:
                 (m, k, n, transposed, squared)
     repeat      a program for consecutive parts of the arguments; detail: (program, times)

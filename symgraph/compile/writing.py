@@ -9,7 +9,7 @@ from itertools import islice
 import casadi as ca
 import numpy as np
 
-from symgraph.compile.differentiate import called
+from symgraph.compile.differentiate import called, handed
 from symgraph.compile.loops import Loop, number
 from symgraph.compile.meetings import Meetings
 from symgraph.compile.program import CALLS, Indices, Operation, Program, Value, constant_of
@@ -74,7 +74,7 @@ class Writer:
     def table(self, kind: str, numbers: Iterable[float] | Iterable[int]) -> str:
         """Return the name of a table of constants; equal ones are one."""
         written = [repr(n) for n in numbers] if kind == "int" else [number(n) for n in numbers]
-        text = ", ".join(written)
+        text = ", ".join(written) or "0"  # standard C has no empty arrays
         key = kind, text.encode()
         if key not in self._tables:
             self._tables[key] = f"t{len(self._tables)}"
@@ -229,7 +229,7 @@ class _FunctionWriter:
                 if self._is_in_place(result, at, arg, begin, step):
                     continue
                 come = f"{self._pointer(arg)} + {begin}{' * B' if self._wide(arg) else ''}"
-                do = "spread" if wide and not self._wide(arg) else "copy"
+                do = "widen" if wide and not self._wide(arg) else "copy"
                 self._lines.append(f"  {do}({to}, {come}, {count}, {step}, {'B' if wide else 1});")
             return
         if (where < 0).any():
@@ -239,7 +239,7 @@ class _FunctionWriter:
             if places.size and not self._is_in_place(result, int(places[0]), arg, 0, 1):
                 pairs = np.stack([places, where[places] - edges[s]], 1)
                 table = self._writer.table("int", pairs.ravel().tolist())
-                do = "spread" if wide and not self._wide(arg) else "copy"
+                do = "widen" if wide and not self._wide(arg) else "copy"
                 pointers = f"{target}, {self._pointer(arg)}"
                 self._lines.append(f"  {do}_some({pointers}, {table}, {places.size}, {'B' if wide else 1});")
 
@@ -329,15 +329,14 @@ class _FunctionWriter:
         self._lines += self._call(operation, operation.detail, list(args), list(results))
 
     def _write_switch(self, operation: Operation) -> None:
-        index, *args = map(self._pointer, operation.args)
+        index = self._pointer(operation.args[0])
         results = list(map(self._pointer, operation.outputs))
         cases = operation.detail
-        inputs = len(args) - len(cases) if len(args) > len(cases[0].inputs) else len(args)
         self._lines.append(f"  switch ((long) ({index})[0]) {{")
-        for i, case in enumerate(cases):
-            blocks = args[inputs + i : inputs + i + 1] if len(args) > inputs else []
+        for i, (case, own) in enumerate(zip(cases, handed(operation), strict=True)):
+            args = list(map(self._pointer, own))
             self._lines.append(f"    {'default' if i == len(cases) - 1 else f'case {i}'}:")
-            self._lines += self._call(operation, case, [*args[:inputs], *blocks], results, "      ")
+            self._lines += self._call(operation, case, args, results, "      ")
             self._lines.append("      break;")
         self._lines.append("  }")
 

@@ -1,0 +1,1 @@
+"""The whole planner as C: a header, a source, and what builds and explains them."""

@@ -1,0 +1,157 @@
+"""export_c: from an objective to a folder with a planner in C."""
+
+from __future__ import annotations
+
+import json
+import re
+import warnings
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Literal
+
+from symgraph.codegen.description import Description, checked_name, describe
+from symgraph.codegen.foresight import foresight
+from symgraph.codegen.header import header
+from symgraph.codegen.pages import build_file, main_program, manual
+from symgraph.codegen.programs import programs_of
+from symgraph.codegen.settings import settings_of
+from symgraph.codegen.source import planner_source
+from symgraph.codegen.stack import stack_of
+from symgraph.codegen.weights import numbers_of, packed
+from symgraph.errors import InputError, StorageError, did_you_mean, names
+from symgraph.objective import PRECISIONS, Objective
+from symgraph.optimizers import Lbfgs, Optimizer
+from symgraph.progress import Progress
+
+
+def export_c(
+    objective: Objective,
+    folder: str | Path,
+    *,
+    name: str = "planner",
+    optimizer: Optimizer | None = None,
+    uncertain: Iterable[str] = (),
+    precision: Literal["double", "single"] | None = None,
+    weights: Literal["constants", "file"] = "constants",
+    progress: bool = True,
+) -> Path:
+    """Write the planner of a task as C: `solve`, and value, gradient and outcomes, for a robot without Python.
+
+    The folder gets `<name>.h` and `<name>.c`, standard C99 that is C++17 too and needs the C library alone, `main.c`, a
+    program around them, `CMakeLists.txt`, `README.md` and `<name>.json`, by which `CPlanner` knows it; with
+    `weights="file"` also `<name>.weights`. The C planner draws the same start points from the same seed as `solve` and
+    climbs in the same steps, so that it finds the same plans, but for rounding.
+
+    Args:
+        objective: of the task.
+        folder: where to; made where it is not there, files of the same names are replaced.
+        name: of the files, and what public names in C begin with.
+        optimizer: `Lbfgs()` if left out; else `Adadelta(…)`, or `Enumerate` of one of these.
+        uncertain: start states that will come with a covariance; others are exact.
+        precision: of the models' arithmetic, the objective's own if left out; "single" halves memory, and is for
+            processors that are slow at doubles. The search itself computes in double.
+        weights: of learned models and other parameters: "constants" of the C file, or a "file" that the program hands
+            over, so that a model fitted anew needs no new build.
+        progress: show a progress bar where it takes longer than two seconds.
+
+    Returns:
+        the folder.
+
+    Raises:
+        InputError: no objective, a name that is no C identifier, states that are none, an optimizer that needs a library.
+        CompileError: a model calls what has no C of its own, as CasADi's solvers and callbacks.
+        StorageError: the folder cannot be written.
+    """
+    if not isinstance(objective, Objective):
+        raise InputError(f"export_c takes an Objective, got {type(objective).__name__}; write Objective(unroll(graph))")
+    name = checked_name(name)
+    optimizer = Lbfgs() if optimizer is None else optimizer
+    precision = objective.precision if precision is None else precision
+    if precision not in PRECISIONS:
+        raise InputError(f"export_c: precision = {precision!r}; give 'double' or 'single'")
+    if weights not in ("constants", "file"):
+        raise InputError(f"export_c: weights = {weights!r}; give 'constants' or 'file'")
+    labels = _uncertain(objective, uncertain)
+    _warn_of_lacking(objective)
+    sizes = tuple(slot.size for slot in objective.graph.selections().values())
+    settings = settings_of(optimizer, objective.n_actions, sizes)
+    with Progress("writing C", progress) as bar:
+        bar.wait("writing C")
+        expectation = objective.build(labels).expectation
+        outcomes, writes = foresight(objective.tree, expectation.inputs)
+        programs = programs_of(expectation, outcomes)
+        numbers = numbers_of(programs, [p.value.ravel(order="F") for p in expectation.inputs.parameters])
+        description = describe(
+            objective,
+            expectation,
+            writes,
+            name=name,
+            precision=precision,
+            weights_in=weights,
+            optimizer=settings.name,
+            settings=settings.given,
+            most_starts=int(settings.macros["MOST_GUESSES"]),
+            notes=_notes(objective),
+        )
+        source = planner_source(description, programs, settings, numbers)
+        stack = stack_of(source.text, _own_stack(description))
+        description = description.with_sizes(source.task, len(numbers), source.memory, stack)
+        files = {
+            f"{name}.h": _named(header(description), name),
+            f"{name}.c": _named(source.text, name),
+            "main.c": _named(main_program(description), name),
+            "CMakeLists.txt": build_file(description),
+            "README.md": _named(manual(description), name),
+            f"{name}.json": json.dumps(description.to_dict(), indent=1) + "\n",
+        }
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for file, text in files.items():
+            (folder / file).write_text(text, encoding="utf-8")
+        if weights == "file":
+            (folder / f"{name}.weights").write_bytes(packed(numbers, precision, source.task))
+    except OSError as error:
+        raise StorageError(f"export_c cannot write to {str(folder)!r}: {error}; give another folder") from error
+    return folder
+
+
+def _uncertain(objective: Objective, labels: Iterable[str]) -> frozenset[str]:
+    given = [labels] if isinstance(labels, str) else list(labels)
+    needed = objective.tree.needed_states
+    for label in given:
+        if label not in needed:
+            raise InputError(
+                f"export_c: uncertain {label!r} is no start state{did_you_mean(label, needed)} Start states: {names(needed)}"
+            )
+    return frozenset(given)
+
+
+def _warn_of_lacking(objective: Objective) -> None:
+    for model in objective.tree.models:
+        if model.lacking:
+            text = f"export_c: model {model.name!r} has {model.lacking}; where solve explores, a generated planner trusts it"
+            warnings.warn(text, stacklevel=3)
+
+
+def _notes(objective: Objective) -> list[str]:
+    cuts = sum(node.cut for node in objective.tree.nodes)
+    if not cuts:
+        return []
+    return [
+        f"{cuts} paths are cut where a node recurs more than {objective.tree.max_visits} times; they count as "
+        f"{objective.tree.cut_value:g} from there"
+    ]
+
+
+def _own_stack(d: Description) -> int:
+    """Return the bytes that a function of the search declares at most."""
+    n, s, k = sum(slot.size for slot in d.actions), len(d.selections), len(d.demands)
+    pointers = len(d.states) + 64
+    return 8 * (6 * (n + 1) + 2 * (k + 1) + pointers) + 4 * 4 * (s + 1) + 1024
+
+
+def _named(text: str, name: str) -> str:
+    text = re.sub(r"\bplanner_(?=\w)", f"{name}_", text)
+    text = re.sub(r"\bPLANNER_(?=\w)", f"{name.upper()}_", text)
+    return text.replace('"planner.h"', f'"{name}.h"')

@@ -1,0 +1,77 @@
+/* Multi-start L-BFGS: sample widely, climb from the most promising samples. symgraph/optimizers/lbfgs.py does the same. */
+
+#define MOST_NEIGHBOURS 8 /* of a combination of selections that are climbed in at once */
+
+#if IMPROVES
+static int was_tried(const struct room *room, const int *choices) {
+  int t;
+  for (t = 0; t < room->tried_count; ++t)
+    if (same_choices(room->tried + t * N_SELECTIONS, choices)) return 1;
+  return 0;
+}
+
+/* Go on from a climb to better neighbours, combinations that differ in one selection. Returns 0 if it had to end. */
+static int improve(Planner *p, struct ended best) {
+  struct room *const room = &p->room.search;
+  int s, c, n, went_on = 1;
+  while (went_on) {
+    struct ended before = best;
+    int count = 0, choices[N_SELECTIONS + 1];
+    went_on = 0;
+    for (s = 0; s < N_SELECTIONS; ++s)
+      for (c = 0; c < sizes[s] && p->held[s] < 0; ++c) {
+        copy_choices(choices, before.choices);
+        choices[s] = c;
+        if (was_tried(room, choices)) continue;
+        if (!may_go_on(p)) return 0;
+        room->near[count][0] = s;
+        room->near[count][1] = c;
+        room->near_merits[count] = merit_at(p, before.x, choices, room->near_fits + count);
+        ++count;
+      }
+    for (n = 0; n < MOST_NEIGHBOURS && n < count; ++n) { /* the most promising ones, one after the other */
+      struct ended made;
+      int first = -1;
+      for (c = 0; c < count; ++c)
+        if (room->near[c][0] >= 0 &&
+            (first < 0 || room->near_fits[c] > room->near_fits[first] ||
+             (room->near_fits[c] == room->near_fits[first] && room->near_merits[c] > room->near_merits[first])))
+          first = c;
+      copy_choices(choices, before.choices);
+      choices[room->near[first][0]] = room->near[first][1];
+      room->near[first][0] = -1;
+      if (room->tried_count == MOST_TRIED) return 1;
+      ++p->plan->starts;
+      if (!climb_from(p, before.x, choices, TOLERANCE, ITERATIONS, &made)) return 0;
+      if (isfinite(made.value) && made.missed >= 0 && is_better(made.value, made.missed, best.value, best.missed)) {
+        best = made;
+        went_on = 1;
+      }
+    }
+  }
+  return 1;
+}
+
+#endif
+static void optimize(Planner *p) {
+  struct room *const room = &p->room.search;
+  int i;
+  for (i = 0; i < MOST_GUESSES + MOST_STARTS; ++i) room->starts[i].used = 0;
+  find_promising(p, STARTS, SAMPLES);
+  add_guesses(p);
+  room->ended_count = 0;
+  for (i = 0; i < MOST_GUESSES + MOST_STARTS && may_go_on(p); ++i) {
+    struct ended made;
+    if (!room->starts[i].used) continue;
+    ++p->plan->starts;
+    if (!climb_from(p, room->starts[i].x, room->starts[i].choices, TOLERANCE, ITERATIONS, &made)) return;
+#if IMPROVES
+    if (isfinite(made.value) && made.missed >= 0) room->ended[room->ended_count++] = made;
+#endif
+  }
+#if IMPROVES
+  if (combinations(p) > STARTS)
+    for (i = 0; i < room->ended_count; ++i)
+      if (!improve(p, room->ended[i])) return;
+#endif
+}
