@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 
 _CONDITION = re.compile(r"^#(if|elif|else|endif|ifdef)\b *(!?)(\w*)")
 _COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
+_STRING = re.compile(r'"(?:\\.|[^"\\])*"')
 _MADE_BY_MACRO = re.compile(r"^[A-Z_]+\((\w+), \w+\)")
 _DEFINED = re.compile(r"^static [^;={]*?(\w+)(?:\(|(?:\[\w*\])* =)", re.DOTALL)
 _WORD = re.compile(r"\b[A-Za-z_]\w*\b")
@@ -56,7 +57,7 @@ def trimmed(text: str) -> str:
     """Return C text without static functions and constants that nothing calls or reads."""
     items = list(_items(text))
     names = [_name(item) for item in items]
-    words = [set(_WORD.findall(_COMMENT.sub("", item))) for item in items]
+    words = [set(_WORD.findall(_STRING.sub("", _COMMENT.sub("", item)))) for item in items]
     by_name: dict[str, list[int]] = {}
     for i, name in enumerate(names):
         if name:

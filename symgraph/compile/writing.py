@@ -131,6 +131,9 @@ class _FunctionWriter:
                 self._end_part()
                 count = 0
         self._write_outputs()
+        if not self._parts:
+            self._writer.defined(self._name, self._shared, self._lines)
+            return self._schedule.work + self._below
         self._end_part()
         given = self._writer.given(self._shared)
         self._writer.defined(self._name, self._shared, [f"  {part}({given});" for part in self._parts])

@@ -1,0 +1,470 @@
+"""CPlanner: a generated planner, compiled and called from Python."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import json
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NoReturn, get_args
+
+import numpy as np
+
+from symgraph.codegen.ctypes_of import Structures, array_of
+from symgraph.codegen.description import FORMAT, Description, StateSlot
+from symgraph.codegen.header import STATUSES
+from symgraph.compile import toolchain
+from symgraph.compile.kernel import Outcome
+from symgraph.errors import CompileError, InputError, SolveError, StorageError, did_you_mean, names
+from symgraph.objective import checked_column
+from symgraph.optimizers.settings import number, positive_whole
+from symgraph.outcomes import NodeOutcome
+from symgraph.plan import Plan, PlanRun
+from symgraph.slots import Array, Gaussian, unchecked_gaussian
+
+OK, TIME_LIMIT, EVALUATION_LIMIT, INTERRUPTED, NO_PLAN = 0, 1, 2, 3, -1
+MOST_RUNS = 4096  # that a plan tells of
+LOOK = 0.05  # [s] between looks at whether Ctrl-C was pressed
+
+_OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)  # in the order of walks.c
+_MESSAGES = {code: told for _, code, told in STATUSES}
+
+# A clock, and a way to end a search from another thread: in C, since both are asked before each evaluation.
+_SHIM = """
+#include <time.h>
+double symgraph_clock(void *user) {
+  struct timespec now;
+  (void) user;
+  clock_gettime(CLOCK_MONOTONIC, &now);
+  return (double) now.tv_sec + 1e-9 * (double) now.tv_nsec;
+}
+int symgraph_progress(void *user, const planner_plan *best) {
+  (void) best;
+  return *(const volatile int *) user;
+}
+"""
+
+
+class CPlanner:
+    """A planner that `export_c` wrote, compiled for this machine, with the interface of `solve` and of an `Objective`.
+
+    Several threads may call it at once.
+
+    Args:
+        folder: what `export_c` returned.
+
+    Raises:
+        StorageError: no planner is there, several are, or a file of it is damaged.
+        CompileError: there is no C compiler, or it refused.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        self.description = _read(self.folder)
+        self.name = self.description.name
+        self._structures = Structures(self.description)
+        self._code = _compiled(self.folder, self.description)
+        self._weights = self._read_weights()
+        self._spare: list[tuple[Array, ctypes.c_void_p]] = []
+        with self._planner():  # what is wrong with the weights is told here
+            pass
+
+    def solve(
+        self,
+        state: Mapping[str, Any],
+        *,
+        guess: Any = None,
+        fixed: Mapping[str, Any] | None = None,
+        seed: int = 0,
+        time_limit: float | None = None,
+        evaluations: int | None = None,
+    ) -> Plan:
+        """Find the best actions and selections; the optimizer is the one that was exported.
+
+        Args:
+            state: label → number, array or Gaussian [unit], as for `solve`.
+            guess: start points to add: a plan, {label: value} of some actions and selections, or a list of them.
+            fixed: {label: value} of actions and selections that are held.
+            seed: of all that is random; with the same seed `solve` finds the same plan, but for rounding.
+            time_limit: after which the best so far is returned [s].
+            evaluations: after which the best so far is returned.
+
+        Returns:
+            a plan; its runs have no history.
+
+        Raises:
+            InputError: a state, guess or fixed value that does not fit.
+            SolveError: no point with a finite value was found.
+        """
+        begin = time.perf_counter()
+        if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**64:
+            raise InputError(f"seed = {seed!r}; give a whole number in [0, 2^64)")
+        if time_limit is not None:
+            number("time_limit", time_limit, "solve", 0.0)
+        if evaluations is not None:
+            positive_whole("evaluations", evaluations, "solve")
+        guesses = _listed(guess)
+        if len(guesses) > self.description.most_starts:
+            raise InputError(f"{len(guesses)} guesses; this planner takes at most {self.description.most_starts}")
+        made = self._structures
+        starts = (made.point * max(len(guesses), 1))(*(self._point(one, "guess", clips=True) for one in guesses))
+        held = self._point({} if fixed is None else fixed, "fixed", clips=False)
+        runs = (made.run * MOST_RUNS)()
+        stop = ctypes.c_int(0)
+        options = made.options(
+            seed=int(seed),
+            evaluations=evaluations or 0,
+            # No time at all is as little as there can be; 0 is no limit.
+            seconds=0.0 if time_limit is None else max(float(time_limit), 1e-12),
+            clock=ctypes.cast(self._code.symgraph_clock, ctypes.c_void_p),
+            progress=ctypes.cast(self._code.symgraph_progress, ctypes.c_void_p),
+            user=ctypes.addressof(stop),
+            starts=ctypes.addressof(starts),
+            start_count=len(guesses),
+            held=ctypes.addressof(held),
+            runs=ctypes.addressof(runs),
+            run_room=MOST_RUNS,
+        )
+        column, plan = self._state(state), made.plan()
+
+        def search() -> int:
+            with self._planner() as planner:
+                return int(self._function("solve")(planner, column, ctypes.byref(options), ctypes.byref(plan)))
+
+        status = _interruptible(search, stop)
+        if status == NO_PLAN:
+            raise SolveError("no start point has a finite value; look for square roots and divisions at 0 in the models")
+        if status < OK:
+            self._refuse(status)
+        actions, selections = self._labelled(plan.actions), self._chosen(plan.selections)
+        return Plan(
+            actions=actions,
+            selections=selections,
+            value=plan.value,
+            violation=plan.violation,
+            status=self._told(status, plan),
+            notes=self.description.notes,
+            nodes=self._outcomes(column, plan.actions, plan.selections),
+            runs=[self._run(run) for run in runs[: min(plan.runs, MOST_RUNS)]],
+            optimizer=f"{self.description.optimizer} in C",
+            seed=int(seed),
+            seconds=time.perf_counter() - begin,
+            units={s.label: s.unit for s in (*self.description.actions, *self.description.states) if s.unit},
+        )
+
+    def value(
+        self,
+        state: Mapping[str, Any],
+        actions: Mapping[str, Any] | None = None,
+        selections: Mapping[str, str] | None = None,
+    ) -> float:
+        """Return the expected sum of rewards, as `Objective.value` does."""
+        value = ctypes.c_double()
+        self._call("value", state, actions, selections, ctypes.byref(value))
+        return value.value
+
+    def gradient(
+        self,
+        state: Mapping[str, Any],
+        actions: Mapping[str, Any] | None = None,
+        selections: Mapping[str, str] | None = None,
+    ) -> dict[str, Any]:
+        """Return ∂J/∂action for each action label, as `Objective.gradient` does."""
+        value, slopes = ctypes.c_double(), self._structures.actions()
+        self._call("gradient", state, actions, selections, ctypes.byref(value), slopes)
+        return self._labelled(slopes)
+
+    def violation(
+        self,
+        state: Mapping[str, Any],
+        actions: Mapping[str, Any] | None = None,
+        selections: Mapping[str, str] | None = None,
+    ) -> float:
+        """Return the largest breach of a requirement, as `Objective.violation` does."""
+        violation = ctypes.c_double()
+        if self.description.demands:
+            self._call("violation", state, actions, selections, ctypes.byref(violation))
+        return violation.value
+
+    def outcomes(
+        self,
+        state: Mapping[str, Any],
+        actions: Mapping[str, Any] | None = None,
+        selections: Mapping[str, str] | None = None,
+    ) -> list[NodeOutcome]:
+        """Return what happens at every node, as `Objective.outcomes` does."""
+        point = self._complete(actions, selections)
+        return self._outcomes(self._state(state), point.actions, point.selections)
+
+    # what C is given
+
+    def _state(self, state: Mapping[str, Any]) -> Any:
+        given = self.description.given
+        if not isinstance(state, Mapping):
+            raise InputError(f"state is {type(state).__name__}; give {{label: number, array or Gaussian}}")
+        known = {slot.label for slot in self.description.states}
+        needed = [slot.label for slot in given]
+        for label in state:
+            if label not in known and did_you_mean(label, needed) != ".":
+                raise InputError(f"state {label!r} is no start state{did_you_mean(label, needed)} They are {names(needed)}")
+        for label in needed:
+            if label not in state:
+                raise InputError(f"state {label!r} is missing; this planner needs {names(needed)}")
+        means, covariances = [], []
+        for slot in given:
+            mean, covariance = _moments(slot, state[slot.label])
+            means.append(mean)
+            covariances.append(covariance)
+        return self._structures.state(*np.concatenate([np.zeros(0), *means, *covariances]).tolist())
+
+    def _point(self, values: Any, place: str, clips: bool) -> Any:
+        """Return {label: value} of some actions and selections as a point; what is left out is NaN and -1."""
+        if not isinstance(values, Mapping):
+            if not hasattr(values, "actions"):
+                raise InputError(f"{place} is {values!r}; give a plan or {{label: value}}")
+            values = {**values.actions, **values.selections}
+        d, point, at = self.description, self._structures.point(), 0
+        labels = [slot.label for slot in (*d.actions, *d.selections)]
+        for label in values:
+            if label not in labels:
+                hint = did_you_mean(label, labels)
+                raise InputError(f"{place}: {label!r} is no action or selection{hint} There are {names(labels)}")
+        for action in d.actions:
+            column = np.full(action.size, np.nan)
+            if action.label in values:
+                column = checked_column(values[action.label], action.size, f"{place}: action {action.label!r}")
+                if clips:
+                    column = np.clip(column, action.low, action.high)
+            point.actions[at : at + action.size] = column.tolist()
+            at += action.size
+        for s, selection in enumerate(d.selections):
+            choice = values.get(selection.label)
+            if choice is not None and choice not in selection.choices:
+                hint = did_you_mean(choice, selection.choices)
+                raise InputError(
+                    f"{place}: selection {selection.label!r}: {choice!r} is not a choice{hint} "
+                    f"Choices: {names(selection.choices)}"
+                )
+            point.selections[s] = -1 if choice is None else selection.choices.index(choice)
+        return point
+
+    def _complete(self, actions: Mapping[str, Any] | None, selections: Mapping[str, str] | None) -> Any:
+        given = {**(actions or {}), **(selections or {})}
+        for slot in (*self.description.actions, *self.description.selections):
+            if slot.label not in given:
+                raise InputError(f"{slot.label!r} is missing; give all actions and selections")
+        return self._point(given, "given", clips=False)
+
+    # what C returns
+
+    def _call(
+        self,
+        name: str,
+        state: Mapping[str, Any],
+        actions: Mapping[str, Any] | None,
+        selections: Mapping[str, str] | None,
+        *results: Any,
+    ) -> None:
+        point, column = self._complete(actions, selections), self._state(state)
+        with self._planner() as planner:
+            status = self._function(name)(planner, column, point.actions, point.selections, *results)
+        if status < OK:
+            self._refuse(status)
+
+    def _outcomes(self, state: Any, actions: Any, selections: Any) -> list[NodeOutcome]:
+        d, out = self.description, self._structures.outcomes()
+        with self._planner() as planner:
+            status = self._function("foresee")(planner, state, actions, selections, ctypes.byref(out))
+        if status < OK:
+            self._refuse(status)
+        moments = array_of(out.moments)
+        known: list[dict[str, Gaussian]] = []
+        for i, node in enumerate(d.nodes):
+            here = dict(known[node.parent]) if node.parent >= 0 else {}
+            for at, state_index, mean, covariance in d.writes:
+                if at == i:
+                    slot = d.states[state_index]
+                    here[slot.label] = _gaussian(moments, slot.size, mean, covariance)
+            known.append(here)
+        order = [slot.label for slot in d.states]
+        return [
+            NodeOutcome(
+                path=node.path,
+                node=node.node,
+                probability=out.probability[i],
+                states={label: known[i][label] for label in order if label in known[i]},
+                reward=out.reward[i],
+                value=out.value[i],
+                deviation=out.deviation[i],
+                cut=node.cut,
+            )
+            for i, node in enumerate(d.nodes)
+        ]
+
+    def _labelled(self, numbers: Any) -> dict[str, Any]:
+        column, made, at = array_of(numbers), {}, 0
+        for slot in self.description.actions:
+            part = column[at : at + slot.size]
+            made[slot.label] = float(part[0]) if slot.size == 1 else part
+            at += slot.size
+        return made
+
+    def _chosen(self, choices: Any) -> dict[str, str]:
+        return {slot.label: slot.choices[choices[s]] for s, slot in enumerate(self.description.selections)}
+
+    def _run(self, run: Any) -> PlanRun:
+        return PlanRun(
+            selections=self._chosen(run.selections),
+            start=self._labelled(run.start),
+            actions=self._labelled(run.actions),
+            value=run.value,
+            outcome=_OUTCOMES[run.outcome],
+            gradients=run.gradients,
+            history=(),
+        )
+
+    def _told(self, status: int, plan: Any) -> str:
+        combinations = int(np.prod([len(slot.choices) for slot in self.description.selections], dtype=float))
+        tried = "" if plan.tried == combinations else f", which tried {plan.tried} of {combinations} combinations of selections"
+        told = f"best of {plan.starts} starts{tried}"
+        heads = {TIME_LIMIT: "time limit: ", EVALUATION_LIMIT: "evaluation limit: ", INTERRUPTED: "interrupted: "}
+        missed = f"requirements are missed, the largest by {plan.missed:.3g}; " if plan.missed > 0.0 else ""
+        return f"{missed}{heads.get(status, '')}{told}"
+
+    # the library
+
+    def _function(self, name: str) -> Any:
+        return getattr(self._code, f"{self.name}_{name}")
+
+    @contextmanager
+    def _planner(self) -> Iterator[ctypes.c_void_p]:
+        """Yield a planner that no other thread uses."""
+        try:
+            memory, planner = self._spare.pop()
+        except IndexError:
+            memory, planner = np.zeros(-(-self.description.memory // 8)), ctypes.c_void_p()
+            weights = [] if self._weights is None else [self._weights.ctypes.data, self._weights_bytes]
+            status = self._function("begin")(memory.ctypes.data, memory.nbytes, *weights, ctypes.byref(planner))
+            if status != OK:
+                self._refuse(status)
+        yield planner
+        self._spare.append((memory, planner))
+
+    def _read_weights(self) -> Array | None:
+        if self.description.weights_in != "file":
+            return None
+        try:
+            content = (self.folder / f"{self.name}.weights").read_bytes()
+        except OSError as error:
+            raise StorageError(f"CPlanner: the weights cannot be read: {error}; export the planner again") from error
+        self._weights_bytes = len(content)
+        numbers = np.zeros(-(-len(content) // 8) + 1)
+        numbers.view(np.uint8)[: len(content)] = np.frombuffer(content, np.uint8)
+        return numbers
+
+    def _refuse(self, status: int) -> NoReturn:
+        told = _MESSAGES[status].replace("PLANNER", self.name.upper()).replace("planner_", f"{self.name}_")
+        if status in (-12, -13, -14):
+            raise StorageError(f"CPlanner: {str(self.folder / self.name)!r}.weights: {told}; export the planner again")
+        raise InputError(f"{self.name}: {told}")
+
+
+def _read(folder: Path) -> Description:
+    try:
+        found = sorted(folder.glob("*.json"))
+        described = [json.loads(path.read_text(encoding="utf-8")) for path in found]
+        planners = [one for one in described if isinstance(one, dict) and {"format", "task", "writes"} <= set(one)]
+    except (OSError, ValueError) as error:
+        raise StorageError(f"CPlanner: {str(folder)!r} cannot be read: {error}; export the planner again") from error
+    if len(planners) != 1:
+        raise StorageError(
+            f"CPlanner: {str(folder)!r} holds {len(planners) or 'no'} planners; give the folder that export_c wrote one to"
+        )
+    if planners[0]["format"] != FORMAT:
+        raise StorageError(f"CPlanner: {str(folder)!r} was written by another version of symgraph; export it again")
+    try:
+        return Description.from_dict(planners[0])
+    except (TypeError, KeyError, AttributeError) as error:
+        raise StorageError(f"CPlanner: the description in {str(folder)!r} is damaged: {error}; export it again") from error
+
+
+def _compiled(folder: Path, description: Description) -> Any:
+    compiler = toolchain.find_compiler()
+    if compiler is None:
+        raise CompileError("CPlanner needs a C compiler: install one, e.g.  apt install gcc, or set CC")
+    name = description.name
+    try:
+        header, source = ((folder / f"{name}{end}").read_text(encoding="utf-8") for end in (".h", ".c"))
+    except OSError as error:
+        raise StorageError(f"CPlanner: {error}; export the planner again") from error
+    text = "#define _POSIX_C_SOURCE 199309L\n" + source.replace(f'#include "{name}.h"', header)
+    text += _SHIM.replace("planner_plan", f"{name}_plan")
+    key = hashlib.sha256(text.encode()).hexdigest()
+    code: Any = toolchain.load(key, lambda: [text], compiler)
+    pointer: Any = ctypes.c_void_p
+    weights = [pointer, ctypes.c_size_t] if description.weights_in == "file" else []
+    getattr(code, f"{name}_begin").argtypes = [pointer, ctypes.c_size_t, *weights, pointer]
+    getattr(code, f"{name}_solve").argtypes = [pointer] * 4
+    getattr(code, f"{name}_value").argtypes = [pointer] * 5
+    getattr(code, f"{name}_gradient").argtypes = [pointer] * 6
+    getattr(code, f"{name}_foresee").argtypes = [pointer] * 5
+    if description.demands:
+        getattr(code, f"{name}_violation").argtypes = [pointer] * 5
+    return code
+
+
+def _interruptible(search: Any, stop: ctypes.c_int) -> int:
+    """Carry out a search so that Ctrl-C ends it early; it is C, which no signal interrupts."""
+    if threading.current_thread() is not threading.main_thread():
+        return int(search())
+    result: list[int | BaseException] = []
+
+    def run() -> None:
+        try:
+            result.append(search())
+        except BaseException as error:
+            result.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    while True:
+        try:
+            while thread.is_alive():
+                thread.join(LOOK)
+            break
+        except KeyboardInterrupt:
+            stop.value = 1
+    if isinstance(result[0], BaseException):
+        raise result[0]
+    return result[0]
+
+
+def _listed(guess: Any) -> list[Any]:
+    if guess is None:
+        return []
+    if isinstance(guess, Sequence) and not isinstance(guess, str):
+        return list(guess)
+    return [guess]
+
+
+def _moments(slot: StateSlot, value: Any) -> tuple[Array, Array]:
+    if isinstance(value, Gaussian):
+        mean = checked_column(value.mean, slot.size, f"state {slot.label!r}")
+        covariance = np.asarray(value.covariance, dtype=float)
+        if covariance.any() and not slot.uncertain:
+            raise InputError(
+                f"state {slot.label!r} comes with a covariance, but this planner takes it for exact: "
+                f"export it with uncertain=[{slot.label!r}]"
+            )
+        return mean, covariance.ravel(order="F") if slot.uncertain else np.zeros(0)
+    column = checked_column(value, slot.size, f"state {slot.label!r}")
+    return column, np.zeros(slot.size**2 if slot.uncertain else 0)
+
+
+def _gaussian(moments: Array, size: int, mean: int, covariance: int) -> Gaussian:
+    spread = np.zeros(size**2) if covariance < 0 else moments[covariance : covariance + size**2]
+    return unchecked_gaussian(moments[mean : mean + size], spread.reshape(size, size, order="F"))
