@@ -6,7 +6,7 @@
 
 /* Fill the queue: starts spread over choices and bounds, after those that are suggested. Returns how many wait. */
 static int fill_queue(Planner *p) {
-  struct room *const room = &p->room.search;
+  struct room *const room = &p->room;
   int i, j, waiting = 0;
   for (i = 0; i < MOST_GUESSES + MOST_STARTS; ++i) room->starts[i].used = 0;
 #if EVENLY
@@ -56,7 +56,7 @@ static int fill_queue(Planner *p) {
 /* Take one point out of the queue: the next one, or, from a queue that points come back to, the best (0.4), a random one (0.3),
    or else the worst is dropped for a perturbed copy of the best finished point. */
 static struct ended take(Planner *p, int *waiting, const struct ended *finished) {
-  struct ended *const queue = p->room.search.ended;
+  struct ended *const queue = p->room.ended;
   struct ended taken;
   int at = 0, i;
 #if REQUEUE
@@ -130,11 +130,12 @@ static int move(Planner *p, struct ended *run, long limit) {
   run->value = p->walk.value;
   run->outcome = p->walk.outcome;
   run->gradients = (long) p->walk.spent;
+  run->scale = scale;
   return 1;
 }
 
 static void optimize(Planner *p) {
-  struct room *const room = &p->room.search;
+  struct room *const room = &p->room;
   struct ended best;
   int waiting = fill_queue(p), finished = 0, i;
   const int wanted = FINISHED > 0 ? FINISHED : waiting;

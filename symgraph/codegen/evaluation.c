@@ -63,10 +63,18 @@ static int has_spent(const Planner *p, double share) {
   return o->seconds > 0 && o->clock(o->user) - p->began >= share * o->seconds;
 }
 
-/* Whether one result is better than another: it misses less, or as much and its value is higher. */
+#define SAME 1e-6 /* breaches that differ by less are equal */
+#ifdef SINGLE
+#define EQUAL 1e-6 /* and values */
+#else
+#define EQUAL 1e-12
+#endif
+
+/* Whether one result is better than another: it misses less, or as much and its value is higher. Values that differ by rounding
+   alone are equal, so that of two searches the same one is taken on all machines. */
 static int is_better(double value, double missed, double other_value, double other_missed) {
   if (missed > other_missed * (1 + SAME)) return 0;
-  return other_missed > missed * (1 + SAME) || value > other_value;
+  return other_missed > missed * (1 + SAME) || value > other_value + EQUAL * fabs(other_value);
 }
 
 static void keep(planner_plan *plan, const double *x, const int *choices, double value, double missed, double violation) {

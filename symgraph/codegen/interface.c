@@ -166,7 +166,7 @@ int planner_solve(planner_planner *p, const planner_state *state, const planner_
   if (wrong) return wrong;
   memset(plan, 0, sizeof *plan);
   memset(&p->room, 0, sizeof p->room);
-  room = &p->room.search;
+  room = &p->room;
   p->options = options;
   p->plan = plan;
   p->over = 0;
@@ -193,9 +193,8 @@ int planner_solve(planner_planner *p, const planner_state *state, const planner_
   spread_points(&p->draws, SCALE_SAMPLES, p->low, p->high, room->typical, room->scratch, room->keys, room->order);
   seed_draws(&p->draws, options->seed);
   search(p);
+  settle(p);
   p->options = 0;
-  if (!p->over && room->found)
-    keep(plan, room->best.x, room->best.choices, room->best.value, room->best.missed, room->best.violation);
   if (options->clock) plan->seconds = options->clock(options->user) - p->began;
   return plan->found ? p->over : PLANNER_NO_PLAN;
 }
@@ -240,57 +239,24 @@ int planner_violation(planner_planner *p, const planner_state *state, const plan
 }
 
 #endif
-/* Values and deviations of the sum of rewards, from the leaves to the root: groups are independent, branches a mixture. */
-static void sum_up(const struct foresight *seen, planner_outcomes *out) {
-  int i, j;
-  out->probability[0] = 1;
-  for (i = 1; i < N_NODES; ++i) {
-    const double before = out->probability[parents[i]];
-    out->probability[i] = before != 0 ? before * (double) seen->shares[i] : 0; /* not 0 · NaN */
-  }
-  for (i = 0; i < N_NODES; ++i) {
-    out->reward[i] = (double) seen->rewards[i];
-    out->value[i] = is_cut[i] ? CUT_VALUE : (double) seen->rewards[i];
-    out->deviation[i] = is_cut[i] ? 0 : (double) seen->variances[i]; /* the variance, until all is summed */
-  }
-  for (i = N_NODES - 1; i > 0; i = j) { /* the branches of a group stand side by side, after all their parents */
-    double mean = 0, spread = 0;
-    int g;
-    for (j = i; j > 0 && groups[j] == groups[i]; --j) {
-      const double share = (double) seen->shares[j];
-      if (share != 0) mean += share * out->value[j];
-    }
-    for (g = i; g > j; --g) {
-      const double share = (double) seen->shares[g], apart = out->value[g] - mean;
-      if (share != 0) spread += share * (out->deviation[g] + apart * apart);
-    }
-    out->value[parents[i]] += mean;
-    out->deviation[parents[i]] += spread;
-  }
-  for (i = 0; i < N_NODES; ++i) out->deviation[i] = sqrt(larger(out->deviation[i], 0));
-}
-
 int planner_foresee(planner_planner *p, const planner_state *state, const planner_actions *actions,
                     const planner_selections *selections, planner_outcomes *outcomes) {
-  const real *arg[N_GIVEN + 1];
-  real *res[4];
+  const struct foresight *seen;
   double x[N_ACTIONS + 1];
   int choices[N_SELECTIONS + 1], wrong, i;
-  struct foresight *seen;
   if (!outcomes) return PLANNER_NULL;
   wrong = take_point(actions, selections, 0, 1, x, choices);
   if (!wrong) wrong = take_state(p, state);
   if (wrong) return wrong;
-  for (i = 0; i < N_ACTIONS; ++i) p->actions[i] = (real) x[i];
-  choose(p, choices);
-  gather_outcomes(p, arg);
-  seen = &p->room.foresight;
-  res[0] = seen->shares;
-  res[1] = seen->rewards;
-  res[2] = seen->variances;
-  res[3] = seen->moments;
-  foresee(arg, res, p->work);
-  sum_up(seen, outcomes);
+  look_ahead(p, x, choices);
+  seen = &p->foresight;
+  for (i = 0; i < N_NODES; ++i) {
+    const double before = i ? outcomes->probability[parents[i]] : 1;
+    outcomes->probability[i] = before != 0 ? before * (double) seen->shares[i] : 0; /* not 0 times NaN */
+    outcomes->reward[i] = (double) seen->rewards[i];
+    outcomes->value[i] = seen->values[i];
+    outcomes->deviation[i] = sqrt(larger(seen->spreads[i], 0));
+  }
   for (i = 0; i < N_MOMENTS; ++i) outcomes->moments[i] = (double) seen->moments[i];
   return PLANNER_OK;
 }

@@ -12,7 +12,7 @@ static int was_tried(const struct room *room, const int *choices) {
 
 /* Go on from a climb to better neighbours, combinations that differ in one selection. Returns 0 if it had to end. */
 static int improve(Planner *p, struct ended best) {
-  struct room *const room = &p->room.search;
+  struct room *const room = &p->room;
   int s, c, n, went_on = 1;
   while (went_on) {
     struct ended before = best;
@@ -54,7 +54,7 @@ static int improve(Planner *p, struct ended best) {
 
 #endif
 static void optimize(Planner *p) {
-  struct room *const room = &p->room.search;
+  struct room *const room = &p->room;
   int i;
   for (i = 0; i < MOST_GUESSES + MOST_STARTS; ++i) room->starts[i].used = 0;
   find_promising(p, STARTS, SAMPLES);

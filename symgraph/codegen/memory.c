@@ -1,4 +1,4 @@
-/* The memory of a planner: what searches keep, what the outcomes of all nodes take (never both at a time), and the rest. */
+/* The memory of a planner. */
 
 struct start {
   double x[N_ACTIONS + 1], merit;
@@ -13,11 +13,12 @@ struct known {
 
 /* A search that has ended: where, and what is missed there; -1: it cannot be judged. */
 struct ended {
-  double x[N_ACTIONS + 1], from[N_ACTIONS + 1], value, missed, violation;
-  int choices[N_SELECTIONS + 1], outcome;
+  double x[N_ACTIONS + 1], from[N_ACTIONS + 1], value, missed, violation, scale;
+  int choices[N_SELECTIONS + 1], outcome, told;
   long gradients;
 };
 
+/* What a search keeps. */
 struct room {
   /* samples of one combination of choices */
   double points[MOST_SAMPLES * N_ACTIONS + 1], scratch[MOST_SAMPLES * N_ACTIONS + 1], keys[MOST_SAMPLES];
@@ -33,8 +34,8 @@ struct room {
   struct ended ended[MOST_GUESSES + MOST_STARTS], polish[MOST_POLISHED];
   int polish_count;
   int ended_count, tried_count, tried[MOST_TRIED * N_SELECTIONS + 1];
-  struct ended best;
-  int found;
+  struct ended done[MOST_DONE]; /* the best ones */
+  int done_count;
   /* neighbours of a combination: a selection, its choice, and how promising they are */
   int near[N_CHOICES + 1][2], near_fits[N_CHOICES + 1];
   double near_merits[N_CHOICES + 1];
@@ -44,8 +45,10 @@ struct room {
   double point[N_ACTIONS + 1], kept_point[N_ACTIONS + 1], moved[N_ACTIONS + 1];
 };
 
+/* The outcomes of all nodes. */
 struct foresight {
   real shares[N_NODES], rewards[N_NODES], variances[N_NODES], moments[N_MOMENTS + 1];
+  double values[N_NODES], spreads[N_NODES]; /* of the rewards from there on */
 };
 
 /* All that a planner keeps, in the memory that the caller hands in. */
@@ -69,10 +72,8 @@ struct planner_planner {
   struct settings settings;
   int never; /* what would end a walk at once */
   struct walk walk;
-  union {
-    struct room search;
-    struct foresight foresight;
-  } room;
+  struct room room;
+  struct foresight foresight;
 };
 
 typedef struct planner_planner Planner;

@@ -97,7 +97,7 @@ static double breach(const Planner *p, const int *choices, double *violation) {
 /* Likewise at a point where a search has ended, and 0 where moves of the actions that rounding hides would make up for it. */
 static double judged_breach(Planner *p, const double *x, const int *choices, const double *units, double *value,
                             double *violation) {
-  double *const found = p->room.search.found_breaches, *const slack = p->room.search.slack, *const moved = p->room.search.moved;
+  double *const found = p->room.found_breaches, *const slack = p->room.slack, *const moved = p->room.moved;
   double most = 0;
   int i, k, missed = 0;
   evaluate(p, x, choices);
@@ -106,7 +106,7 @@ static double judged_breach(Planner *p, const double *x, const int *choices, con
   for (k = 0; k < N_MARGINS; ++k) {
     found[k] = counts(k, choices) ? violation_of(k, p->margins[k]) : 0;
     slack[k] = 0;
-    p->room.search.at_end[k] = p->margins[k];
+    p->room.at_end[k] = p->margins[k];
     missed |= found[k] != 0;
     *violation = larger(*violation, found[k]);
   }
@@ -117,7 +117,7 @@ static double judged_breach(Planner *p, const double *x, const int *choices, con
     moved[i] += (x[i] > (low + high) / 2 ? -1 : 1) * MOVE * (high - low);
     evaluate(p, moved, choices);
     for (k = 0; k < N_MARGINS; ++k) {
-      const double change = fabs(p->margins[k] - p->room.search.at_end[k]);
+      const double change = fabs(p->margins[k] - p->room.at_end[k]);
       if (isfinite(change)) slack[k] += change;
     }
     moved[i] = x[i];
@@ -148,7 +148,7 @@ static double merit(Planner *p, const double *multipliers, const double *weights
 
 /* Walk from x where the walk's settings lead, on J less penalties. Returns 0 if it had to end. */
 static int walk_on_merit(Planner *p, const double *x, const int *choices, double tolerance, double scale) {
-  const struct room *room = &p->room.search;
+  const struct room *room = &p->room;
   struct walk *const walk = &p->walk;
   int goes_on = 1;
   begin_walk(walk, &p->settings, x, tolerance, scale, 0);
@@ -166,8 +166,8 @@ static int walk_on_merit(Planner *p, const double *x, const int *choices, double
 static void first_weights(Planner *p, double scale, const double *units) {
   int k;
   for (k = 0; k < N_MARGINS; ++k) {
-    p->room.search.multipliers[k] = 0;
-    p->room.search.weights[k] = isinf(units[k]) ? 0 : FIRST_WEIGHT * scale / (units[k] * units[k]);
+    p->room.multipliers[k] = 0;
+    p->room.weights[k] = isinf(units[k]) ? 0 : FIRST_WEIGHT * scale / (units[k] * units[k]);
   }
 }
 
@@ -175,7 +175,7 @@ static void first_weights(Planner *p, double scale, const double *units) {
    but a point on the way that meets all is not given up. Returns 0 if it had to end. */
 static int climb_within(Planner *p, const double *x, const int *choices, double tolerance, double scale, const double *units,
                         long iterations, long *gradients) {
-  struct room *const room = &p->room.search;
+  struct room *const room = &p->room;
   double before = INFINITY, slack = FIRST_TOLERANCE, growth = 1, kept_value = 0;
   int rounds = 0, keeps = 0, k;
   first_weights(p, scale, units);

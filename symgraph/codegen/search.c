@@ -27,9 +27,23 @@ static int walk_on_value(Planner *p, const double *x, const int *choices, double
 }
 
 #endif
-/* Judge where a walk has ended, and compare it with the best so far. */
+/* Keep a search that has ended, if need be instead of the worst one that is kept. */
+static void keep_done(struct room *room, const struct ended *made) {
+  int i, worst = 0;
+  if (room->done_count < MOST_DONE) {
+    room->done[room->done_count++] = *made;
+    return;
+  }
+  for (i = 1; i < MOST_DONE; ++i)
+    if (is_better(room->done[worst].value, room->done[worst].missed, room->done[i].value, room->done[i].missed)) worst = i;
+  if (!is_better(made->value, made->missed, room->done[worst].value, room->done[worst].missed)) return;
+  for (i = worst; i < MOST_DONE - 1; ++i) room->done[i] = room->done[i + 1]; /* in order: of equals the first one counts */
+  room->done[i] = *made;
+}
+
+/* Judge where a walk has ended, and keep it. */
 static void end_search(Planner *p, struct ended *made, const struct known *here) {
-  struct room *const room = &p->room.search;
+  struct room *const room = &p->room;
   const planner_options *o = p->options;
   planner_plan *plan = p->plan;
 #if REQUIREMENTS
@@ -54,11 +68,8 @@ static void end_search(Planner *p, struct ended *made, const struct known *here)
   plan->gradients += made->gradients;
   note_tried(room, made->choices);
   plan->tried = room->tried_count;
-  if (!isfinite(made->value) || made->missed < 0) return;
-  if (!room->found || is_better(made->value, made->missed, room->best.value, room->best.missed)) {
-    room->best = *made;
-    room->found = 1;
-  }
+  made->told = 0;
+  if (isfinite(made->value) && made->missed >= 0) keep_done(room, made);
 }
 
 /* Climb from a point by L-BFGS. Returns 0 if it had to end. */
@@ -80,6 +91,7 @@ static int climb_from(Planner *p, const double *x, const int *choices, double to
   copy_actions(made->x, walk->x);
   made->value = walk->value;
   made->outcome = walk->outcome;
+  made->scale = here->scale;
   end_search(p, made, here);
   return 1;
 }

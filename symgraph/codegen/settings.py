@@ -13,6 +13,7 @@ MOST_GUESSES = 16  # start points from the caller
 MOST_SAMPLES_OF_ONE = 1024  # of one combination of selections, as in optimizers/starts.py
 MOST_TRIED = 1024  # combinations of selections that a search keeps in mind
 MOST_KNOWN = 64  # and of which it keeps how large differences of J are there
+MOST_DONE = 64  # searches that have ended, of which the best whose value is borne out counts
 SCALE_SAMPLES = 32
 SAMPLING = 0.25  # of a budget, after which no more samples are looked at
 MOST_COMBINATIONS = 1_000_000_001  # what more are counted as: beyond 10^9 selections are drawn one by one
@@ -70,6 +71,7 @@ def settings_of(optimizer: Optimizer, n_actions: int, choices: tuple[int, ...]) 
         "KNOWN": min(combinations, MOST_KNOWN, max(starts, MOST_GUESSES)),
         "MOST_TRIED": min(combinations, MOST_TRIED),
         "MOST_POLISHED": 2 * min(combinations, starts + MOST_GUESSES),
+        "MOST_DONE": min(MOST_DONE, starts + MOST_GUESSES),
         "MOST_COMBINATIONS": MOST_COMBINATIONS,
         "SCALE_SAMPLES": SCALE_SAMPLES,
         "SAMPLING": SAMPLING,

@@ -82,6 +82,7 @@ def planner_source(description: Description, programs: Programs, settings: Setti
             _part("starts.c"),
             _part("search.c"),
             _part(settings.file),
+            _part("foresight.c"),
             _part("interface.c"),
         ]
     )
@@ -106,7 +107,6 @@ def _head(real: str, d: Description) -> str:
         f"typedef {real} real;",
         f"#define MATH(name) name{'f' if real == 'float' else ''}",
         *(["#define SINGLE"] if real == "float" else []),
-        "#define SAME 1e-6 /* breaches that differ by less are equal */",
     ]
     return "\n".join(lines)
 
@@ -132,6 +132,7 @@ def _numbers(d: Description, programs: Programs, work: int, weights: int) -> dic
         "TAPE": programs.forward.outputs[-1].size,
         "WORK": work,
         "CUT_VALUE": d.cut_value,
+        "RISK": d.risk,
     }
 
 
@@ -147,7 +148,7 @@ def _memory(m: dict[str, int | float], d: Description) -> int:
     samples, rows, choices = int(m["MOST_SAMPLES"]), int(m["ROWS"]), int(m["N_CHOICES"])
     waiting = int(m["MOST_GUESSES"]) + int(m["MOST_STARTS"])
     pairs = max(1, min(n, 8))
-    ended = 8 * (2 * (n + 1) + 5) + 4 * (s + 3)
+    ended = 8 * (2 * (n + 1) + 6) + 4 * (s + 4)
     start = 8 * (n + 2) + 4 * (s + 4)
     walk = 8 * (2 * (pairs * n + 1) + 13 * (n + 1) + 40)
     room = (
@@ -157,20 +158,20 @@ def _memory(m: dict[str, int | float], d: Description) -> int:
         + 8 * (32 * (n + k + 1) + 2)
         + int(m["KNOWN"]) * (8 * (k + 2) + 4 * (s + 3) + 4)
         + waiting * (start + ended)
-        + (int(m["MOST_POLISHED"]) + 1) * ended
+        + (int(m["MOST_POLISHED"]) + int(m["MOST_DONE"])) * ended
         + 4 * (int(m["MOST_TRIED"]) * s + 8)
         + 20 * (choices + 2)
         + 8 * 6 * (k + 1)
         + 8 * 3 * (n + 1)
     )
-    seen = real * (3 * len(d.nodes) + d.moments + 1)
+    seen = real * (3 * len(d.nodes) + d.moments + 1) + 16 * len(d.nodes)
     own = (
         8 * (3 * (n + 1) + k + 40)
         + 4 * (s + 2)
         + real * (2 * (n + 1) + choices + int(m["N_STATE"]) + 2 * (k + 1) + 3)
         + real * (int(m["BLOCK"]) + int(m["TAPE"]) + int(m["WORK"]) + 3)
     )
-    return (own + walk + max(room, seen) + 256 + 63) // 64 * 64
+    return (own + walk + room + seen + 256 + 63) // 64 * 64
 
 
 def _tables(d: Description) -> Iterable[str]:

@@ -28,7 +28,7 @@ static double scale_from(double *values, int count) {
 
 /* What is kept of a combination of choices; the oldest entry makes room for a new one. */
 static struct known *entry(Planner *p, const int *choices) {
-  struct room *const room = &p->room.search;
+  struct room *const room = &p->room;
   struct known *here;
   int i;
   for (i = 0; i < KNOWN; ++i)
@@ -43,7 +43,7 @@ static struct known *entry(Planner *p, const int *choices) {
 
 /* What is known of a combination of choices, found out where it is not, at points that are always the same ones. */
 static struct known *known(Planner *p, const int *choices) {
-  struct room *const room = &p->room.search;
+  struct room *const room = &p->room;
   struct known *const here = entry(p, choices);
   int i, k;
   if (here->scale > 0) return here;
@@ -62,7 +62,7 @@ static struct known *known(Planner *p, const int *choices) {
 
 /* Rows of choices: all combinations as often as they fit, and some of them at random; or each selection at random. */
 static void draw_rows(Planner *p, int count, int evenly) {
-  struct room *const room = &p->room.search;
+  struct room *const room = &p->room;
   const long all = combinations(p);
   int r, s;
   if (!evenly || (double) all > MOST_EVEN) {
@@ -98,7 +98,7 @@ static double merit_at(Planner *p, const double *x, const int *choices, int *fit
 /* Of samples sorted by merit, the best one and those of the better half that lie farthest from any better one. Leaves `count`
    of them at the beginning of `order`. */
 static void find_peaks(Planner *p, int samples, int count) {
-  struct room *const room = &p->room.search;
+  struct room *const room = &p->room;
   const int half = (int) more(count, (samples + 1) / 2);
   int a, b, i;
   sort_indices(room->order, samples, room->merits, 0);
@@ -131,7 +131,7 @@ static int comes_before(const struct start *a, const struct start *b) {
 /* Sample the bounds under one combination of choices, and keep the most promising points: `each` of them in turn with those of
    other combinations, or those that are among the best of all. */
 static void sample(Planner *p, const int *choices, int count, int each, int group, int groups, int starts) {
-  struct room *const room = &p->room.search;
+  struct room *const room = &p->room;
 #if REQUIREMENTS
   struct known *const here = known(p, choices);
 #endif
@@ -188,7 +188,7 @@ static void find_promising(Planner *p, int starts, int samples) {
   const int groups = (int) fewer(all, more(starts, MOST_SAMPLES_OF_ONE));
   const int each = (int) more(1, starts / groups);
   const int count = N_ACTIONS ? (int) more(each, fewer(each * samples, MOST_SAMPLES_OF_ONE)) : 1;
-  struct room *const room = &p->room.search;
+  struct room *const room = &p->room;
   int g;
   draw_rows(p, groups, 1);
   for (g = 0; g < groups && may_go_on(p); ++g) {
@@ -199,7 +199,7 @@ static void find_promising(Planner *p, int starts, int samples) {
 
 /* Put the caller's start points first. Actions that they leave out are drawn, selections are those that promise most there. */
 static void add_guesses(Planner *p) {
-  struct room *const room = &p->room.search;
+  struct room *const room = &p->room;
   const planner_options *o = p->options;
   const int count = o->start_count;
   int g, i, s, r, count_of_rows;

@@ -20,6 +20,7 @@ from symgraph.slots import Array, Choices
 SCALE_SAMPLES = 32
 FEWEST_SAMPLES = 16
 SAME = 1e-6  # breaches that differ by less are equal
+EQUAL = 1e-12  # and values
 GUESS_COMBINATIONS = 1024  # of selections that a guess leaves out
 
 
@@ -264,10 +265,18 @@ class Optimizer(ABC):
 def best_of(runs: Sequence[Run]) -> Run | None:
     """Return the run with the highest finite value of those that meet all requirements, the first of equals.
 
-    If none does, the one whose largest breach is least, of equal ones that with the highest value.
+    If none does, the one whose largest breach is least, of equal ones that with the highest value. Values that differ by
+    rounding alone are equal: which run a plan comes from must not depend on the machine.
     """
-    finite = [run for run in runs if np.isfinite(run.value) and not np.isnan(run.missed)]
-    if not finite:
-        return None
-    least = min(run.missed for run in finite)
-    return max((run for run in finite if run.missed <= least * (1.0 + SAME)), key=lambda run: run.value)
+    best: Run | None = None
+    for run in runs:
+        if np.isfinite(run.value) and not np.isnan(run.missed) and (best is None or _is_better(run, best)):
+            best = run
+    return best
+
+
+def _is_better(run: Run, best: Run) -> bool:
+    if run.missed > best.missed * (1.0 + SAME):
+        return False
+    fewer = best.missed > run.missed * (1.0 + SAME)
+    return fewer or run.value > best.value + EQUAL * abs(best.value)
