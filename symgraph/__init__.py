@@ -1,6 +1,8 @@
 """symgraph plans tasks that form a directed graph: skills to choose, chance, uncertainty, continuous actions."""
 
 from symgraph import learned
+from symgraph.codegen.cplanner import CPlanner
+from symgraph.codegen.export import export_c
 from symgraph.errors import (
     CompileError,
     GraphError,
@@ -27,6 +29,7 @@ __all__ = [
     "Action",
     "Adadelta",
     "Bonmin",
+    "CPlanner",
     "CompileError",
     "Enumerate",
     "Gaussian",
@@ -50,6 +53,7 @@ __all__ = [
     "StorageError",
     "SymgraphError",
     "Tree",
+    "export_c",
     "learned",
     "plot_map",
     "plot_runs",

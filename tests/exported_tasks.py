@@ -1,4 +1,4 @@
-"""Tasks whose planners are written in C, with random situations: those of the paper, pouring with networks of two sizes."""
+"""Tasks whose planners are written in C, with random situations: the paper's, pouring with networks of two sizes."""
 
 from functools import cache
 

@@ -55,7 +55,7 @@ static int fill_queue(Planner *p) {
 
 /* Take one point out of the queue: the next one, or, from a queue that points come back to, the best (0.4), a random one (0.3),
    or else the worst is dropped for a perturbed copy of the best finished point. */
-static struct ended take(Planner *p, int *waiting, const struct ended *finished) {
+static struct ended take_next(Planner *p, int *waiting, const struct ended *finished) {
   struct ended *const queue = p->room.ended;
   struct ended taken;
   int at = 0, i;
@@ -107,11 +107,11 @@ static void keep_for_polish(struct room *room, const struct ended *run) {
 /* Move a point by ADADELTA. Returns 0 if it had to end. */
 static int move(Planner *p, struct ended *run, long limit) {
 #if SCALED
-  const struct known *here = known(p, run->choices);
+  const struct known *here = knowledge_of(p, run->choices);
   const double scale = here->scale;
 #else
 #if REQUIREMENTS
-  const struct known *here = known(p, run->choices);
+  const struct known *here = knowledge_of(p, run->choices);
 #endif
   const double scale = 1;
 #endif
@@ -153,7 +153,7 @@ static void optimize(Planner *p) {
 #endif
     const long limit = fewer(RUN_ITERATIONS, more(1, (total - spent) / batch));
     for (i = 0; i < batch; ++i) {
-      struct ended run = take(p, &waiting, finished ? &best : 0), judged;
+      struct ended run = take_next(p, &waiting, finished ? &best : 0), judged;
       if (!may_go_on(p) || !move(p, &run, limit)) return;
       spent += run.gradients - 1;
 #if POLISH
@@ -161,7 +161,7 @@ static void optimize(Planner *p) {
 #endif
       judged = run;
 #if REQUIREMENTS
-      end_search(p, &judged, known(p, run.choices));
+      end_search(p, &judged, knowledge_of(p, run.choices));
 #else
       end_search(p, &judged, 0);
 #endif

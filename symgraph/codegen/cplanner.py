@@ -137,7 +137,9 @@ class CPlanner:
 
         status = _interruptible(search, stop)
         if status == NO_PLAN:
-            raise SolveError("no start point has a finite value; look for square roots and divisions at 0 in the models")
+            raise SolveError(
+                "no start point has a finite value; look for square roots and divisions at 0 in the models"
+            )
         if status < OK:
             self._refuse(status)
         actions, selections = self._labelled(plan.actions), self._chosen(plan.selections)
@@ -153,7 +155,7 @@ class CPlanner:
             optimizer=f"{self.description.optimizer} in C",
             seed=int(seed),
             seconds=time.perf_counter() - begin,
-            units={s.label: s.unit for s in (*self.description.actions, *self.description.states) if s.unit},
+            units=self.description.units,
         )
 
     def value(
@@ -210,7 +212,9 @@ class CPlanner:
         needed = [slot.label for slot in given]
         for label in state:
             if label not in known and did_you_mean(label, needed) != ".":
-                raise InputError(f"state {label!r} is no start state{did_you_mean(label, needed)} They are {names(needed)}")
+                raise InputError(
+                    f"state {label!r} is no start state{did_you_mean(label, needed)} They are {names(needed)}"
+                )
         for label in needed:
             if label not in state:
                 raise InputError(f"state {label!r} is missing; this planner needs {names(needed)}")
@@ -228,7 +232,7 @@ class CPlanner:
                 raise InputError(f"{place} is {values!r}; give a plan or {{label: value}}")
             values = {**values.actions, **values.selections}
         d, point, at = self.description, self._structures.point(), 0
-        labels = [slot.label for slot in (*d.actions, *d.selections)]
+        labels = d.decided
         for label in values:
             if label not in labels:
                 hint = did_you_mean(label, labels)
@@ -254,9 +258,9 @@ class CPlanner:
 
     def _complete(self, actions: Mapping[str, Any] | None, selections: Mapping[str, str] | None) -> Any:
         given = {**(actions or {}), **(selections or {})}
-        for slot in (*self.description.actions, *self.description.selections):
-            if slot.label not in given:
-                raise InputError(f"{slot.label!r} is missing; give all actions and selections")
+        for label in self.description.decided:
+            if label not in given:
+                raise InputError(f"{label!r} is missing; give a value to each of {names(self.description.decided)}")
         return self._point(given, "given", clips=False)
 
     # what C returns
@@ -329,7 +333,11 @@ class CPlanner:
 
     def _told(self, status: int, plan: Any) -> str:
         combinations = int(np.prod([len(slot.choices) for slot in self.description.selections], dtype=float))
-        tried = "" if plan.tried == combinations else f", which tried {plan.tried} of {combinations} combinations of selections"
+        tried = (
+            ""
+            if plan.tried == combinations
+            else f", which tried {plan.tried} of {combinations} combinations of selections"
+        )
         told = f"best of {plan.starts} starts{tried}"
         heads = {TIME_LIMIT: "time limit: ", EVALUATION_LIMIT: "evaluation limit: ", INTERRUPTED: "interrupted: "}
         missed = f"requirements are missed, the largest by {plan.missed:.3g}; " if plan.missed > 0.0 else ""
@@ -382,14 +390,16 @@ def _read(folder: Path) -> Description:
         raise StorageError(f"CPlanner: {str(folder)!r} cannot be read: {error}; export the planner again") from error
     if len(planners) != 1:
         raise StorageError(
-            f"CPlanner: {str(folder)!r} holds {len(planners) or 'no'} planners; give the folder that export_c wrote one to"
+            f"CPlanner: {str(folder)!r} holds {len(planners) or 'no'} planners; give a folder of export_c's"
         )
     if planners[0]["format"] != FORMAT:
         raise StorageError(f"CPlanner: {str(folder)!r} was written by another version of symgraph; export it again")
     try:
         return Description.from_dict(planners[0])
     except (TypeError, KeyError, AttributeError) as error:
-        raise StorageError(f"CPlanner: the description in {str(folder)!r} is damaged: {error}; export it again") from error
+        raise StorageError(
+            f"CPlanner: the description in {str(folder)!r} is damaged: {error}; export it again"
+        ) from error
 
 
 def _compiled(folder: Path, description: Description) -> Any:

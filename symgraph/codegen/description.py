@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import keyword
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -16,13 +15,16 @@ from symgraph.objective import Objective
 
 FORMAT = 1  # of the description
 
+# Keywords of C and C++, and names that programs must not take.
 _C_WORDS = frozenset(
-    "alignas alignof auto bool break case catch char char8_t char16_t char32_t class compl concept const constexpr continue "
-    "decltype default delete do double else enum explicit export extern false float for friend goto if inline int long "
-    "main mutable namespace new noexcept not nullptr operator or private protected public register reinterpret_cast "
-    "requires restrict return short signed sizeof static static_assert static_cast struct switch template this "
-    "thread_local throw true try typedef typeid typename union unsigned using virtual void volatile wchar_t while xor "
-    "and bitand bitor asm complex imaginary".split()
+    """
+    alignas alignof and asm auto bitand bitor bool break case catch char char16_t char32_t char8_t class compl
+    complex concept const constexpr continue decltype default delete do double else enum explicit export
+    extern false float for friend goto if imaginary inline int long main mutable namespace new noexcept not
+    nullptr operator or private protected public register reinterpret_cast requires restrict return short
+    signed sizeof static static_assert static_cast struct switch template this thread_local throw true try
+    typedef typeid typename union unsigned using virtual void volatile wchar_t while xor
+    """.split()  # noqa: SIM905 a list of them would be a page
 )
 
 
@@ -117,6 +119,17 @@ class Description:
     def given(self) -> tuple[StateSlot, ...]:
         return tuple(slot for slot in self.states if slot.given)
 
+    @property
+    def decided(self) -> list[str]:
+        """Labels of actions and selections."""
+        return [slot.label for slot in self.actions] + [slot.label for slot in self.selections]
+
+    @property
+    def units(self) -> dict[str, str]:
+        """{label: unit} of the actions and states that have one."""
+        found = {slot.label: slot.unit for slot in self.actions} | {slot.label: slot.unit for slot in self.states}
+        return {label: unit for label, unit in found.items() if unit}
+
     def with_sizes(self, task: int, weights: int, memory: int, stack: int) -> Description:
         return replace(self, task=task, weights=weights, memory=memory, stack=stack)
 
@@ -130,8 +143,16 @@ class Description:
         def listed(kind: type, rows: Iterable[dict[str, Any]]) -> tuple[Any, ...]:
             return tuple(kind(**{key: _tuples(value) for key, value in row.items()}) for row in rows)
 
-        kinds = {"actions": ActionSlot, "selections": SelectionSlot, "states": StateSlot, "nodes": Node, "demands": Demand}
-        made = {key: listed(kinds[key], value) if key in kinds else _tuples(value) for key, value in read.items()}
+        kinds: dict[str, type] = {
+            "actions": ActionSlot,
+            "selections": SelectionSlot,
+            "states": StateSlot,
+            "nodes": Node,
+            "demands": Demand,
+        }
+        made: dict[str, Any] = {
+            key: listed(kinds[key], value) if key in kinds else _tuples(value) for key, value in read.items()
+        }
         return cls(**made)
 
 
@@ -172,7 +193,9 @@ def describe(
         risk=objective.risk,
         cut_value=float(tree.cut_value),
         actions=tuple(
-            ActionSlot(label, fields[label], slot.size, slot.unit, tuple(slot.lower.tolist()), tuple(slot.upper.tolist()))
+            ActionSlot(
+                label, fields[label], slot.size, slot.unit, tuple(slot.lower.tolist()), tuple(slot.upper.tolist())
+            )
             for label, slot in actions.items()
         ),
         selections=tuple(
@@ -238,6 +261,5 @@ def c_names(words: Iterable[str]) -> list[str]:
 def checked_name(name: object) -> str:
     """Return the prefix of all public names, or raise InputError."""
     if isinstance(name, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) and name not in _C_WORDS:
-        if not keyword.iskeyword(name):
-            return name
+        return name
     raise InputError(f"export_c: name = {name!r}; give a C identifier, e.g. 'cannon'")

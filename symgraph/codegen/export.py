@@ -58,7 +58,8 @@ def export_c(
         the folder.
 
     Raises:
-        InputError: no objective, a name that is no C identifier, states that are none, an optimizer that needs a library.
+        InputError: no objective, a name that is no C identifier, states that are none, an optimizer that needs a
+            library.
         CompileError: a model calls what has no C of its own, as CasADi's solvers and callbacks.
         StorageError: the folder cannot be written.
     """
@@ -121,17 +122,18 @@ def _uncertain(objective: Objective, labels: Iterable[str]) -> frozenset[str]:
     needed = objective.tree.needed_states
     for label in given:
         if label not in needed:
-            raise InputError(
-                f"export_c: uncertain {label!r} is no start state{did_you_mean(label, needed)} Start states: {names(needed)}"
-            )
+            hint = did_you_mean(label, needed)
+            raise InputError(f"export_c: uncertain {label!r} is no start state{hint} Start states: {names(needed)}")
     return frozenset(given)
 
 
 def _warn_of_lacking(objective: Objective) -> None:
     for model in objective.tree.models:
         if model.lacking:
-            text = f"export_c: model {model.name!r} has {model.lacking}; where solve explores, a generated planner trusts it"
-            warnings.warn(text, stacklevel=3)
+            warnings.warn(
+                f"export_c: model {model.name!r} has {model.lacking}; where solve explores, a planner in C trusts it",
+                stacklevel=3,
+            )
 
 
 def _notes(objective: Objective) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator
 
 from symgraph.codegen.description import Description
@@ -46,7 +47,7 @@ def _main(d: Description) -> Iterator[str]:
     words = " ".join(f"{slot.label}({slot.size})" if slot.size > 1 else slot.label for slot in d.given)
     covariances = " ".join(f"covariance of {slot.label}({slot.size**2})" for slot in d.given if slot.uncertain)
     order = " ".join(part for part in (words, covariances) if part) or "(nothing)"
-    yield f"/* Reads a state from its arguments, plans, and prints the plan. Copyright-free: use it as you like. */"
+    yield "/* Reads a state from its arguments, plans, and prints the plan. */"
     yield '#include "planner.h"'
     yield ""
     yield "#include <stdio.h>"
@@ -96,11 +97,11 @@ def _main(d: Description) -> Iterator[str]:
     yield "    fprintf(stderr, usage, arguments[0]);"
     yield "    return 2;"
     yield "  }"
-    yield f"  for (i = 0; at + i < count; ++i) {{"
+    yield "  for (i = 0; at + i < count; ++i) {"
     yield "    char *end;"
     yield "    numbers[i] = strtod(arguments[at + i], &end);"
     yield "    if (*end || end == arguments[at + i]) {"
-    yield '      fprintf(stderr, "\'%s\' is no number\\n", arguments[at + i]);'
+    yield "      fprintf(stderr, \"'%s' is no number\\n\", arguments[at + i]);"
     yield "      return 2;"
     yield "    }"
     yield "  }"
@@ -139,10 +140,18 @@ def _main(d: Description) -> Iterator[str]:
     yield "  status = planner_foresee(planner, &state, &plan.actions, &plan.selections, &outcomes);"
     yield "  for (i = 0; status == PLANNER_OK && i < PLANNER_NODES; ++i)"
     yield "    if (outcomes.probability[i] > 0)"
-    what = '"  %s: probability %.3g, value %.6g\\n", paths[i]' if len(d.nodes) <= 200 else '"  node %d: probability %.3g, value %.6g\\n", i'
+    what = (
+        '"  %s: probability %.3g, value %.6g\\n", paths[i]'
+        if len(d.nodes) <= 200
+        else '"  node %d: probability %.3g, value %.6g\\n", i'
+    )
     yield f"      printf({what}, outcomes.probability[i], outcomes.value[i]);"
     yield "  return 0;"
     yield "}"
+
+
+def _paragraph(text: str) -> list[str]:
+    return textwrap.wrap(text, 110, break_long_words=False, break_on_hyphens=False)
 
 
 def _quoted(text: str) -> str:
@@ -163,15 +172,19 @@ def _manual(d: Description) -> Iterator[str]:
     yield ""
     yield "## Build"
     yield ""
-    yield f"Add `{d.name}.c` and `{d.name}.h` to your build, or the folder with `add_subdirectory` and link `{d.name}`. On its own:"
+    yield f"Add `{d.name}.c` and `{d.name}.h` to your build; or add the folder with `add_subdirectory` and link"
+    yield f"`{d.name}`. On its own:"
     yield ""
     yield "```console"
     yield "$ cmake -B build . && cmake --build build"
     yield f"$ ./build/{d.name}_main --help"
     yield "```"
     yield ""
-    yield "Standard C99 (and C++17); the C library's mathematics is all that it needs. It allocates nothing and has no variables of"
-    yield "its own: each planner lives in memory that you hand in. On a processor of your own choice, `-O3 -march=native` pays."
+    yield from _paragraph(
+        "It is standard C99, and C++17, and needs the C library's mathematics alone. It allocates nothing and has no "
+        "variables of its own: each planner lives in memory that you hand in. Where it is possible, "
+        "`-O3 -march=native` pays."
+    )
     yield ""
     yield "## Use"
     yield ""
@@ -190,9 +203,12 @@ def _manual(d: Description) -> Iterator[str]:
     yield "if (planner_solve(planner, &state, 0, &plan) >= 0) …"
     yield "```"
     yield ""
-    yield "`planner_options` says the rest: a seed, start points, what is held, budgets of evaluations and of time (with a clock of"
-    yield "yours), and a function that is called before each evaluation, in which the plan so far can be read. Zeros are good"
-    yield "defaults. `planner_value`, `planner_gradient` and `planner_foresee` tell what a point is worth and what it leads to."
+    yield from _paragraph(
+        "`planner_options` says the rest: a seed, start points, what is held, budgets of evaluations and of time (with "
+        "a clock of yours), and a function that is called before each evaluation, in which the plan so far can be read. "
+        "Zeros are good defaults. `planner_value`, `planner_gradient` and `planner_foresee` tell what a point is worth "
+        "and what it leads to."
+    )
     yield ""
     yield "| | |"
     yield "|---|---|"
@@ -212,7 +228,8 @@ def _manual(d: Description) -> Iterator[str]:
         yield f"| `{slot.name}` | {slot.size} | {slot.unit or ''} |"
     for slot in d.given:
         if slot.uncertain:
-            yield f"| `{slot.name}_covariance` | {slot.size**2}, column by column | {f'({slot.unit})²' if slot.unit else ''} |"
+            unit = f"({slot.unit})²" if slot.unit else ""
+            yield f"| `{slot.name}_covariance` | {slot.size**2}, column by column | {unit} |"
     yield ""
     if d.actions:
         yield "## Actions"

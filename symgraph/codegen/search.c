@@ -74,7 +74,7 @@ static void end_search(Planner *p, struct ended *made, const struct known *here)
 
 /* Climb from a point by L-BFGS. Returns 0 if it had to end. */
 static int climb_from(Planner *p, const double *x, const int *choices, double tolerance, long iterations, struct ended *made) {
-  const struct known *here = known(p, choices);
+  const struct known *here = knowledge_of(p, choices);
   struct walk *const walk = &p->walk;
   int complete;
   p->settings.ascends = 0;

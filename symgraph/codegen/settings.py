@@ -58,7 +58,7 @@ def settings_of(optimizer: Optimizer, n_actions: int, choices: tuple[int, ...]) 
         file, macros, flags = _adadelta(inner, len(choices))
     else:
         raise InputError(
-            f"export_c: optimizer is {optimizer!r}, which needs a library; give Lbfgs(), Adadelta() or Enumerate() of one"
+            f"export_c: optimizer is {optimizer!r}, which needs a library; give Lbfgs(), Adadelta() or Enumerate(…)"
         )
     starts, samples = int(macros["MOST_STARTS"]), int(macros["SAMPLES"])
     flags["ENUMERATES"] = enumerates

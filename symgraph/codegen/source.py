@@ -105,7 +105,7 @@ def _head(real: str, d: Description) -> str:
         "#include <string.h>",
         "",
         f"typedef {real} real;",
-        f"#define MATH(name) name{'f' if real == 'float' else ''}",
+        f"#define MATH(name) name{'##f' if real == 'float' else ''}",
         *(["#define SINGLE"] if real == "float" else []),
     ]
     return "\n".join(lines)

@@ -42,7 +42,7 @@ static struct known *entry(Planner *p, const int *choices) {
 }
 
 /* What is known of a combination of choices, found out where it is not, at points that are always the same ones. */
-static struct known *known(Planner *p, const int *choices) {
+static struct known *knowledge_of(Planner *p, const int *choices) {
   struct room *const room = &p->room;
   struct known *const here = entry(p, choices);
   int i, k;
@@ -82,7 +82,7 @@ static void draw_rows(Planner *p, int count, int evenly) {
 /* What a search from a point may come to: J there less penalties; -INFINITY where it is not finite. */
 static double merit_at(Planner *p, const double *x, const int *choices, int *fits) {
 #if REQUIREMENTS
-  const struct known *here = known(p, choices);
+  const struct known *here = knowledge_of(p, choices);
   double value;
   *fits = 0;
   if (!may_go_on(p) || !look(p, x, choices)) return -INFINITY;
@@ -133,7 +133,7 @@ static int comes_before(const struct start *a, const struct start *b) {
 static void sample(Planner *p, const int *choices, int count, int each, int group, int groups, int starts) {
   struct room *const room = &p->room;
 #if REQUIREMENTS
-  struct known *const here = known(p, choices);
+  struct known *const here = knowledge_of(p, choices);
 #endif
   int looked = 0, r, i, e;
   double scale;

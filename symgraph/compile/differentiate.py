@@ -36,8 +36,8 @@ class Differentiator:
     def with_weighted_gradient(self, program: Program, by: int) -> Program:
         """Return the program with one more input, a weight for each number of its second output, and one more output.
 
-        This is the gradient, by an input, of the first output, a number, plus the weighted sum of the second one. Numbers
-        of weight 0 have no part in it, even if their slopes are not finite.
+        This is the gradient, by an input, of the first output, a number, plus the weighted sum of the second one.
+        Numbers of weight 0 have no part in it, even if their slopes are not finite.
         """
         inputs = [Value(x.size, x.kind) for x in program.inputs]
         weights = Value(program.outputs[1].size, Kind.BLOCK)

@@ -40,9 +40,7 @@ def in_halves(program: Program, count: int) -> tuple[Program, Program]:
     return forward, _second(program, count, tape, [o for o in program.operations if o in first], rest)
 
 
-def _second(
-    program: Program, count: int, tape: list[Value], first: list[Operation], rest: list[Operation]
-) -> Program:
+def _second(program: Program, count: int, tape: list[Value], first: list[Operation], rest: list[Operation]) -> Program:
     kept = Value(sum(value.size for value in tape), Kind.LANE)
     backward = Program(f"{program.name}_reverse", [*(Value(x.size, x.kind) for x in program.inputs), kept])
     new = dict(zip(program.inputs, backward.inputs, strict=False))

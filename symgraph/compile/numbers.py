@@ -39,7 +39,7 @@ def _carried_out(operation: Operation, args: list[Array]) -> list[Array]:
         case "accumulate":
             targets, *indices = detail
             terms = np.prod([arg[index] for arg, index in zip(args, indices, strict=True)], axis=0)
-            return [np.bincount(targets, terms, sizes[0])]
+            return [np.asarray(np.bincount(targets, terms, sizes[0]), dtype=float)]
         case "call":
             return run(detail, args)
         case "repeat":
@@ -56,6 +56,8 @@ def _carried_out(operation: Operation, args: list[Array]) -> list[Array]:
     raise AssertionError(f"{operation.code!r} is nothing that follows from parameters alone")
 
 
-def _product(left: Array, right: Array, m: int, k: int, n: int, transposed: bool = False, squared: bool = False) -> Array:
+def _product(
+    left: Array, right: Array, m: int, k: int, n: int, transposed: bool = False, squared: bool = False
+) -> Array:
     matrix = left.reshape(m, k) if transposed else left.reshape(k, m).T
     return np.asarray((matrix**2 if squared else matrix) @ right.reshape(n, k).T).ravel(order="F")

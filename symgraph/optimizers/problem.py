@@ -265,8 +265,8 @@ class Optimizer(ABC):
 def best_of(runs: Sequence[Run]) -> Run | None:
     """Return the run with the highest finite value of those that meet all requirements, the first of equals.
 
-    If none does, the one whose largest breach is least, of equal ones that with the highest value. Values that differ by
-    rounding alone are equal: which run a plan comes from must not depend on the machine.
+    If none does, the one whose largest breach is least, of equal ones that with the highest value. Values that differ
+    by rounding alone are equal: which run a plan comes from must not depend on the machine.
     """
     best: Run | None = None
     for run in runs:
