@@ -205,7 +205,7 @@ def _manual(d: Description) -> Iterator[str]:
     yield ""
     yield from _paragraph(
         "`planner_options` says the rest: a seed, start points, what is held, budgets of evaluations and of time (with "
-        "a clock of yours), and a function that is called before each evaluation, in which the plan so far can be read. "
+        "a clock of yours), and a function that is called before each evaluation, which may read the plan so far. "
         "Zeros are good defaults. `planner_value`, `planner_gradient` and `planner_foresee` tell what a point is worth "
         "and what it leads to."
     )

@@ -8,8 +8,8 @@
 
 /* z (m, n) = NUMBER(w (m, k)) x (k, n). */
 #define MULTIPLY(name, NUMBER) \
-  static void name(const real *w, const real *x, real *z, long m, long k, long n) { \
-    long i, j, p; \
+  static void name(const real *w, const real *x, real *z, int m, int k, int n) { \
+    int i, j, p; \
     for (j = 0; j < n; ++j, x += k, z += m) { \
       const real *a = w; \
       for (i = 0; i < m; ++i) z[i] = 0; \
@@ -27,8 +27,8 @@ MULTIPLY(multiply_squares, SQUARE)
 
 /* z (m, n) = NUMBER(w (k, m))^T x (k, n). */
 #define MULTIPLY_TRANSPOSED(name, NUMBER) \
-  static void name(const real *w, const real *x, real *z, long m, long k, long n) { \
-    long i, j, p, s; \
+  static void name(const real *w, const real *x, real *z, int m, int k, int n) { \
+    int i, j, p, s; \
     for (j = 0; j < n; ++j, x += k, z += m) { \
       const real *a = w; \
       for (i = 0; i < m; ++i, a += k) { \

@@ -106,6 +106,7 @@ def _head(real: str, d: Description) -> str:
         "",
         f"typedef {real} real;",
         f"#define MATH(name) name{'##f' if real == 'float' else ''}",
+        f"#define LEAST_EXPONENT {'-87.0f' if real == 'float' else '-708.0'}",
         *(["#define SINGLE"] if real == "float" else []),
     ]
     return "\n".join(lines)
