@@ -23,7 +23,7 @@ from symgraph.requirement import Requirement, Side
 from symgraph.slots import Array
 from symgraph.tree import Tree
 
-UNUSED = -1e300  # margin of an inequality on a branch that is not chosen; infinity times 0 would be NaN
+UNUSED = -1e30  # margin of an inequality on a branch that is not chosen; infinity times 0 would be NaN
 
 
 @dataclass(frozen=True)

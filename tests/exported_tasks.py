@@ -19,6 +19,32 @@ def _push():
     return sg.Objective(sg.unroll(push.graph())), ("first", "second")
 
 
+def _toss():
+    """A choice of how to toss, a network that says how far it flies, and a requirement."""
+    rng = np.random.default_rng(0)
+    network = sg.learned.StochasticNetwork(
+        {"speed": 1, "angle": 1, "weight": 1}, {"distance": 1}, hidden=(8, 8), name="F_toss", propagation="diagonal"
+    )
+    x = rng.uniform((1.0, 0.2, 0.5), (4.0, 1.3, 2.0), (60, 3))
+    y = x[:, :1] ** 2 / 9.81 * np.sin(2 * x[:, 1:2]) / x[:, 2:] + 0.02 * rng.normal(size=(60, 1))
+    network.fit(x, y, progress=False)
+    slots = {
+        "speed": sg.Action(low=1.0, high=4.0, unit="m/s"),
+        "angle": sg.State(unit="rad"),
+        "arm": sg.Selection(["flat", "steep"]),
+        "weight": sg.State(unit="kg"),
+        "goal": sg.State(unit="m"),
+        "distance": sg.State(unit="m"),
+    }
+    graph = sg.Graph(slots, start="held")
+    angles = {"flat": lambda: {"angle": 0.4}, "steep": lambda: {"angle": 1.1}}
+    graph.choose("held", "arm", {arm: ("aimed", angle) for arm, angle in angles.items()})
+    graph.edge("aimed", "landed", network)
+    graph.reward("landed", lambda distance, goal: -((distance - goal) ** 2))
+    graph.require("landed", lambda distance: distance, low=0.1, confidence=0.9)
+    return sg.Objective(sg.unroll(graph)), ("weight",)
+
+
 def _pouring(hidden):
     """With networks that are fitted to what arbitrary smooth functions say: not the world's, but nothing is flat."""
     rng = np.random.default_rng(0)
@@ -31,7 +57,7 @@ def _pouring(hidden):
     return sg.Objective(sg.unroll(pouring.graph(flow, release, amount))), ("receiver_corners",)
 
 
-MAKERS = {"cannon": _cannon, "push": _push} | {name: lambda h=hidden: _pouring(h) for name, hidden in SIZES.items()}
+MAKERS = {"cannon": _cannon, "push": _push, "toss": _toss} | {name: lambda h=hidden: _pouring(h) for name, hidden in SIZES.items()}
 
 
 @cache
@@ -48,6 +74,8 @@ def situations(name, count, seed=0):
             yield cannon.state(rng.uniform(0.3, 2.9), rng.uniform(0.0, 0.6))
         elif name == "push":
             yield push.state(rng.uniform(0.2, 0.8, 2), rng.uniform(0.01, 0.1), rng.uniform(0.2, 0.8, 2), 0.05)
+        elif name == "toss":
+            yield {"weight": sg.Gaussian(rng.uniform(0.7, 1.8), sd=0.1), "goal": rng.uniform(0.2, 1.2)}
         else:
             x, y, rim = rng.uniform(0.6, 1.0), 0.2, rng.uniform(0.1, 0.3)
             corners = [(x + a, b, rim) for a in (0.15, -0.15) for b in (y, -y)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import json
+import math
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,6 +30,11 @@ from symgraph.slots import Array, Gaussian, unchecked_gaussian
 OK, TIME_LIMIT, EVALUATION_LIMIT, INTERRUPTED, NO_PLAN = 0, 1, 2, 3, -1
 MOST_RUNS = 4096  # that a plan tells of
 LOOK = 0.05  # [s] between looks at whether Ctrl-C was pressed
+
+FLAGS = ("-fPIC", "-std=c99", "-O3", "-march=native", "-ffp-contract=off", "-fno-math-errno")
+# It calls functions of its own with the upper halves of vector registers in use unless it is told not to, and what they
+# call of the C library takes twice as long.
+GCC_FLAGS = ("-fno-ipa-ra",)
 
 _OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)  # in the order of walks.c
 _MESSAGES = {code: told for _, code, told in STATUSES}
@@ -332,15 +338,17 @@ class CPlanner:
         )
 
     def _told(self, status: int, plan: Any) -> str:
-        combinations = int(np.prod([len(slot.choices) for slot in self.description.selections], dtype=float))
-        tried = (
-            ""
-            if plan.tried == combinations
-            else f", which tried {plan.tried} of {combinations} combinations of selections"
-        )
-        told = f"best of {plan.starts} starts{tried}"
+        d = self.description
+        combinations = math.prod(len(slot.choices) for slot in d.selections)
+        told = f"best of {plan.starts} starts"
+        if plan.tried < combinations:
+            told += f", which tried {plan.tried} of {combinations} combinations of selections"
+        elif d.optimizer.startswith("Enumerate"):
+            told = f"enumerated {combinations} combinations of selections: {told}"
         heads = {TIME_LIMIT: "time limit: ", EVALUATION_LIMIT: "evaluation limit: ", INTERRUPTED: "interrupted: "}
-        missed = f"requirements are missed, the largest by {plan.missed:.3g}; " if plan.missed > 0.0 else ""
+        missed = ""
+        if plan.worst >= 0:
+            missed = f"requirements are missed: {d.demands[plan.worst].told} by {plan.missed:.3g}; "
         return f"{missed}{heads.get(status, '')}{told}"
 
     # the library
@@ -414,7 +422,7 @@ def _compiled(folder: Path, description: Description) -> Any:
     text = "#define _POSIX_C_SOURCE 199309L\n" + source.replace(f'#include "{name}.h"', header)
     text += _SHIM.replace("planner_plan", f"{name}_plan")
     key = hashlib.sha256(text.encode()).hexdigest()
-    code: Any = toolchain.load(key, lambda: [text], compiler)
+    code: Any = toolchain.load(key, lambda: [text], compiler, FLAGS + GCC_FLAGS * toolchain.is_gcc(compiler))
     pointer: Any = ctypes.c_void_p
     weights = [pointer, ctypes.c_size_t] if description.weights_in == "file" else []
     getattr(code, f"{name}_begin").argtypes = [pointer, ctypes.c_size_t, *weights, pointer]

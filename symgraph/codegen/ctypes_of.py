@@ -26,7 +26,7 @@ class Structures:
         self.selections = ctypes.c_int * max(len(d.selections), 1)
         long, double, whole, pointer = ctypes.c_long, ctypes.c_double, ctypes.c_int, ctypes.c_void_p
         numbers = ("value", "violation", "missed", "seconds")
-        counts = ("found", "starts", "tried", "runs")
+        counts = ("worst", "found", "starts", "tried", "runs")
         points = [("actions", self.actions), ("selections", self.selections)]
         self.point = _structure("Point", points)
         self.plan = _structure(

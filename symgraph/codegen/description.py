@@ -178,7 +178,9 @@ def describe(
     selections = objective.graph.selections()
     actions = objective.graph.actions()
     labels = dict.fromkeys([*tree.needed_states, *(write.label for write in writes)])
-    fields = dict(zip([*actions, *selections, *labels], c_names([*actions, *selections, *labels]), strict=True))
+    taken = [f"{name}_covariance" for name in c_names(expectation.inputs.uncertain)]  # members of the state too
+    words = [*actions, *selections, *labels]
+    fields = dict(zip(words, c_names([*taken, *words])[len(taken) :], strict=True))
     order = list(labels)
     sizes = {label: slots[label].size for label in labels}
     places = [(w.node, order.index(w.label), w.mean, w.covariance) for w in writes]

@@ -77,12 +77,14 @@ static int is_better(double value, double missed, double other_value, double oth
   return other_missed > missed * (1 + SAME) || value > other_value + EQUAL * fabs(other_value);
 }
 
-static void keep(planner_plan *plan, const double *x, const int *choices, double value, double missed, double violation) {
+static void keep(planner_plan *plan, const double *x, const int *choices, double value, double missed, double violation,
+                 int worst) {
   memcpy(&plan->actions, x, N_ACTIONS * sizeof(double));
   memcpy(&plan->selections, choices, N_SELECTIONS * sizeof(int));
   plan->value = value;
   plan->missed = missed;
   plan->violation = violation;
+  plan->worst = worst;
   plan->found = 1;
 }
 
@@ -96,11 +98,11 @@ static int look(Planner *p, const double *x, const int *choices) {
   evaluate(p, inside, choices);
   ++plan->evaluations;
 #if REQUIREMENTS
-  p->missed = breach(p, choices, &p->violation);
+  p->missed = breach(p, choices, &p->violation, &p->worst);
 #endif
   if (!isfinite(p->value)) return 0;
   if (p->missed >= 0 && (!plan->found || is_better(p->value, p->missed, plan->value, plan->missed)))
-    keep(plan, inside, choices, p->value, p->missed, p->violation);
+    keep(plan, inside, choices, p->value, p->missed, p->violation, p->worst);
   return 1;
 }
 

@@ -14,6 +14,7 @@ from symgraph.codegen.foresight import foresight
 from symgraph.codegen.header import header
 from symgraph.codegen.pages import build_file, main_program, manual
 from symgraph.codegen.programs import programs_of
+from symgraph.codegen.ros2 import copies, package_name, ros2_files
 from symgraph.codegen.settings import settings_of
 from symgraph.codegen.source import planner_source
 from symgraph.codegen.stack import stack_of
@@ -33,6 +34,7 @@ def export_c(
     uncertain: Iterable[str] = (),
     precision: Literal["double", "single"] | None = None,
     weights: Literal["constants", "file"] = "constants",
+    ros2: bool = False,
     progress: bool = True,
 ) -> Path:
     """Write the planner of a task as C: `solve`, and value, gradient and outcomes, for a robot without Python.
@@ -52,6 +54,7 @@ def export_c(
             processors that are slow at doubles. The search itself computes in double.
         weights: of learned models and other parameters: "constants" of the C file, or a "file" that the program hands
             over, so that a model fitted anew needs no new build.
+        ros2: write a ROS 2 package with a planning service too, to `ros2/<name>_planning`.
         progress: show a progress bar where it takes longer than two seconds.
 
     Returns:
@@ -97,7 +100,7 @@ def export_c(
         source = planner_source(description, programs, settings, numbers)
         stack = stack_of(source.text, _own_stack(description))
         description = description.with_sizes(source.task, len(numbers), source.memory, stack)
-        files = {
+        files: dict[str, str | bytes] = {
             f"{name}.h": _named(header(description), name),
             f"{name}.c": _named(source.text, name),
             "main.c": _named(main_program(description), name),
@@ -105,13 +108,18 @@ def export_c(
             "README.md": _named(manual(description), name),
             f"{name}.json": json.dumps(description.to_dict(), indent=1) + "\n",
         }
+        if weights == "file":
+            files[f"{name}.weights"] = packed(numbers, precision, source.task)
+        if ros2:
+            package = f"ros2/{package_name(description)}"
+            files |= {f"{package}/{path}": text for path, text in ros2_files(description).items()}
+            files |= {f"{package}/{path}": files[file] for file, path in copies(description).items()}
     folder = Path(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for file, text in files.items():
-            (folder / file).write_text(text, encoding="utf-8")
-        if weights == "file":
-            (folder / f"{name}.weights").write_bytes(packed(numbers, precision, source.task))
+        for file, content in files.items():
+            path = folder / file
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content if isinstance(content, bytes) else content.encode())
     except OSError as error:
         raise StorageError(f"export_c cannot write to {str(folder)!r}: {error}; give another folder") from error
     return folder

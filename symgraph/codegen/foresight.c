@@ -70,7 +70,7 @@ static void settle(Planner *p) {
         continue;
       }
     }
-    keep(p->plan, best->x, best->choices, best->value, best->missed, best->violation);
+    keep(p->plan, best->x, best->choices, best->value, best->missed, best->violation, best->worst);
     return;
   }
 }

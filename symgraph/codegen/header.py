@@ -155,6 +155,7 @@ def _types(d: Description) -> Iterator[str]:
     yield "  double violation; /* the largest breach of a requirement, in the unit of its model; 0 if all are met */"
     yield "  double missed;    /* the same, and 0 if it is rounding */"
     yield "  double seconds;   /* that the search took, by the caller's clock */"
+    yield "  int worst;        /* the requirement that is missed most, as README.md counts them from 0, or -1 */"
     yield "  int found;        /* whether there is a plan yet */"
     yield "  int starts;       /* points that were searched from */"
     yield "  int tried;        /* combinations of choices among them */"

@@ -170,6 +170,7 @@ int planner_solve(planner_planner *p, const planner_state *state, const planner_
   p->options = options;
   p->plan = plan;
   p->over = 0;
+  p->worst = -1;
   p->began = options->clock ? options->clock(options->user) : 0;
   for (i = 0; i < N_ACTIONS; ++i) {
     p->low[i] = lower[i];
@@ -232,9 +233,9 @@ int planner_gradient(planner_planner *p, const planner_state *state, const plann
 #if REQUIREMENTS
 int planner_violation(planner_planner *p, const planner_state *state, const planner_actions *actions,
                       const planner_selections *selections, double *violation) {
-  int choices[N_SELECTIONS + 1];
+  int choices[N_SELECTIONS + 1], worst;
   const int wrong = violation ? evaluate_at(p, state, actions, selections, choices) : PLANNER_NULL;
-  if (!wrong && breach(p, choices, violation) < 0) *violation = NAN;
+  if (!wrong && breach(p, choices, violation, &worst) < 0) *violation = NAN;
   return wrong;
 }
 

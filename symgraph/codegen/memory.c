@@ -14,7 +14,7 @@ struct known {
 /* A search that has ended: where, and what is missed there; -1: it cannot be judged. */
 struct ended {
   double x[N_ACTIONS + 1], from[N_ACTIONS + 1], value, missed, violation, scale;
-  int choices[N_SELECTIONS + 1], outcome, told;
+  int choices[N_SELECTIONS + 1], outcome, told, worst;
   long gradients;
 };
 
@@ -65,6 +65,7 @@ struct planner_planner {
   /* what is told of the point that was looked at last */
   double value, margins[N_MARGINS + 1], gradient[N_ACTIONS + 1];
   double missed, violation; /* by how much requirements are, rounding left out, and at all */
+  int worst;                /* which one is missed most, or -1 */
   /* inputs, results and workspace of the generated functions */
   real actions[N_ACTIONS + 1], chosen[N_CHOICES + 1], state[N_STATE + 1], pulls[N_MARGINS + 1];
   real result[1], result_margins[N_MARGINS + 1], slopes[N_ACTIONS + 1];

@@ -1,22 +1,43 @@
 /* Products of matrices in column-major order, in standard C that compilers turn into vectors: matrices of weights stand as they
-   are, and each of their numbers is read once. */
+   are, and are read once for two columns. */
 
-#define STRIDE 4 /* columns that are taken at once */
-#define SUMS 8   /* of one column, side by side, since the order of one sum must not be changed */
+#define SUMS 8 /* of one column, side by side, since the order of one sum must not be changed */
 #define PLAIN(w) (w)
 #define SQUARE(w) ((w) * (w))
 
-/* z (m, n) = NUMBER(w (m, k)) x (k, n). */
+/* z (m, n) = NUMBER(w (m, k)) x (k, n): four columns of w at once, for two columns of x. */
 #define MULTIPLY(name, NUMBER) \
   static void name(const real *w, const real *x, real *z, int m, int k, int n) { \
     int i, j, p; \
-    for (j = 0; j < n; ++j, x += k, z += m) { \
-      const real *a = w; \
-      for (i = 0; i < m; ++i) z[i] = 0; \
-      for (p = 0; p + STRIDE <= k; p += STRIDE, a += STRIDE * m) { \
-        const real f = x[p], g = x[p + 1], h = x[p + 2], l = x[p + 3]; \
+    for (i = 0; i < m * n; ++i) z[i] = 0; \
+    for (j = 0; j + 2 <= n; j += 2, x += 2 * k, z += 2 * m) { \
+      const real *a = w, *const y = x + k; \
+      real *const v = z + m; \
+      for (p = 0; p + 4 <= k; p += 4, a += 4 * m) { \
+        const real x0 = x[p], x1 = x[p + 1], x2 = x[p + 2], x3 = x[p + 3]; \
+        const real y0 = y[p], y1 = y[p + 1], y2 = y[p + 2], y3 = y[p + 3]; \
         const real *const b = a + m, *const c = b + m, *const d = c + m; \
-        for (i = 0; i < m; ++i) z[i] += NUMBER(a[i]) * f + NUMBER(b[i]) * g + NUMBER(c[i]) * h + NUMBER(d[i]) * l; \
+        for (i = 0; i < m; ++i) { \
+          const real e = NUMBER(a[i]), f = NUMBER(b[i]), g = NUMBER(c[i]), h = NUMBER(d[i]); \
+          const real sum = z[i] + (e * x0 + f * x1) + (g * x2 + h * x3); \
+          v[i] += (e * y0 + f * y1) + (g * y2 + h * y3); \
+          z[i] = sum; \
+        } \
+      } \
+      for (; p < k; ++p, a += m) \
+        for (i = 0; i < m; ++i) { \
+          const real sum = z[i] + NUMBER(a[i]) * x[p]; \
+          v[i] += NUMBER(a[i]) * y[p]; \
+          z[i] = sum; \
+        } \
+    } \
+    if (j < n) { \
+      const real *a = w; \
+      for (p = 0; p + 4 <= k; p += 4, a += 4 * m) { \
+        const real x0 = x[p], x1 = x[p + 1], x2 = x[p + 2], x3 = x[p + 3]; \
+        const real *const b = a + m, *const c = b + m, *const d = c + m; \
+        for (i = 0; i < m; ++i) \
+          z[i] += (NUMBER(a[i]) * x0 + NUMBER(b[i]) * x1) + (NUMBER(c[i]) * x2 + NUMBER(d[i]) * x3); \
       } \
       for (; p < k; ++p, a += m) \
         for (i = 0; i < m; ++i) z[i] += NUMBER(a[i]) * x[p]; \

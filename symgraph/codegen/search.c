@@ -48,11 +48,13 @@ static void end_search(Planner *p, struct ended *made, const struct known *here)
   planner_plan *plan = p->plan;
 #if REQUIREMENTS
   if (isfinite(made->value)) {
-    made->missed = judged_breach(p, made->x, made->choices, here->units, &made->value, &made->violation);
+    made->missed = judged_breach(p, made->x, made->choices, here->units, &made->value, &made->violation,
+                                 &made->worst);
   }
 #else
   (void) here;
   made->missed = made->violation = 0;
+  made->worst = -1;
 #endif
   if (o->runs && plan->runs < o->run_room) {
     planner_run *run = o->runs + plan->runs;

@@ -79,6 +79,7 @@ def planner_source(description: Description, programs: Programs, settings: Setti
             "",
             _part("requirements.c") if description.demands else "",
             _part("evaluation.c"),
+            _part("multipliers.c") if description.demands else "",
             _part("starts.c"),
             _part("search.c"),
             _part(settings.file),
@@ -149,7 +150,7 @@ def _memory(m: dict[str, int | float], d: Description) -> int:
     samples, rows, choices = int(m["MOST_SAMPLES"]), int(m["ROWS"]), int(m["N_CHOICES"])
     waiting = int(m["MOST_GUESSES"]) + int(m["MOST_STARTS"])
     pairs = max(1, min(n, 8))
-    ended = 8 * (2 * (n + 1) + 6) + 4 * (s + 4)
+    ended = 8 * (2 * (n + 1) + 6) + 4 * (s + 5)
     start = 8 * (n + 2) + 4 * (s + 4)
     walk = 8 * (2 * (pairs * n + 1) + 13 * (n + 1) + 40)
     room = (

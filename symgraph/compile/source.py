@@ -76,8 +76,19 @@ def gradient_program(function: ca.Function) -> Program:
 
 
 PRECISION = {
-    False: "typedef double real;\ntypedef long long whole;\n#define MATH(name) name\n#define LEAST_EXPONENT -708.0",
-    True: "typedef float real;\ntypedef int whole;\n#define MATH(name) name##f\n#define SINGLE\n#define LEAST_EXPONENT -87.0f",
+    False: """
+typedef double real;
+typedef long long whole;
+#define MATH(name) name
+#define LEAST_EXPONENT -708.0
+""",
+    True: """
+typedef float real;
+typedef int whole;
+#define MATH(name) name##f
+#define LEAST_EXPONENT -87.0f
+#define SINGLE
+""",
 }
 
 

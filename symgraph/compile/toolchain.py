@@ -56,26 +56,28 @@ def find_compiler() -> str | None:
     return None
 
 
-def load(key: str, source: Callable[[], list[str]], compiler: str) -> ctypes.CDLL:
+def load(key: str, source: Callable[[], list[str]], compiler: str, flags: tuple[str, ...] | None = None) -> ctypes.CDLL:
     """Compile C source, or find it compiled, and load it.
 
     Args:
         key: what the source follows from.
         source: makes it, one translation unit or several, where it is not found compiled.
         compiler: the path of the compiler.
+        flags: for it, those of kernels if left out.
 
     Raises:
         CompileError: the compiler, the disk or the loader refused.
     """
     try:
         folder = _private_folder()
-        flags = "\0".join([key, *_identity(compiler), *FLAGS, *vector_library()[0]])
-        key = hashlib.sha256(flags.encode()).hexdigest()[:32]
+        flags = FLAGS if flags is None else flags
+        joined = "\0".join([key, *_identity(compiler), *flags, *vector_library()[0]])
+        key = hashlib.sha256(joined.encode()).hexdigest()[:32]
         for path in folder.glob(f"{key}-*.so"):
             if path.name == _name(key, path):
                 return ctypes.CDLL(str(path))
             path.unlink(missing_ok=True)  # cut short by a crash or a full disk: make it anew
-        return ctypes.CDLL(str(_compile(source(), compiler, folder, key)))
+        return ctypes.CDLL(str(_compile(source(), compiler, folder, key, flags)))
     except OSError as error:
         raise CompileError(f"compiling with {compiler} failed: {error}") from error
 
@@ -90,7 +92,7 @@ def vector_library() -> tuple[tuple[str, ...], tuple[str, ...]]:
     return (), ("-lm",)
 
 
-def _compile(units: list[str], compiler: str, cache_folder: Path, key: str) -> Path:
+def _compile(units: list[str], compiler: str, cache_folder: Path, key: str, flags: tuple[str, ...]) -> Path:
     # Compiled in a folder of its own and moved into place at once, so that processes may race for it.
     with tempfile.TemporaryDirectory(dir=cache_folder) as folder, ThreadPoolExecutor(os.cpu_count()) as pool:
         made = Path(folder, "kernel.so")
@@ -99,7 +101,7 @@ def _compile(units: list[str], compiler: str, cache_folder: Path, key: str) -> P
         def compiled(i: int) -> str:
             source, result = Path(folder, f"unit{i}.c"), Path(folder, f"unit{i}.o")
             source.write_text(units[i])
-            _run([compiler, "-c", *FLAGS, *macros, str(source), "-o", str(result)])
+            _run([compiler, "-c", *flags, *macros, str(source), "-o", str(result)])
             return str(result)
 
         objects = list(pool.map(compiled, range(len(units))))
@@ -140,6 +142,11 @@ def _process_folder() -> Path:
 @cache
 def _temporary() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="symgraph-")  # goes when the process ends
+
+
+def is_gcc(compiler: str) -> bool:
+    """Whether a compiler is GNU's, or says that it is none other."""
+    return "clang" not in _identity(compiler)[1].lower()
 
 
 @cache
