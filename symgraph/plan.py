@@ -152,10 +152,10 @@ class Plan:
         """Return the picture of the tree with probabilities and expected values; unselected branches are pale.
 
         Raises:
-            GraphError: the plan comes from another process and left its tree there.
+            GraphError: the plan comes from another process, or from C, and has no tree with it.
         """
         if not isinstance(self.nodes, NodeOutcomes):
-            raise GraphError("this plan came from another process without its tree; draw it where it was made")
+            raise GraphError("this plan came without its tree, from another process or from C; draw one of solve's own")
         notes = {}
         for i, node in enumerate(self.nodes):
             if node.probability:

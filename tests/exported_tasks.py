@@ -57,7 +57,9 @@ def _pouring(hidden):
     return sg.Objective(sg.unroll(pouring.graph(flow, release, amount))), ("receiver_corners",)
 
 
-MAKERS = {"cannon": _cannon, "push": _push, "toss": _toss} | {name: lambda h=hidden: _pouring(h) for name, hidden in SIZES.items()}
+MAKERS = {"cannon": _cannon, "push": _push, "toss": _toss} | {
+    name: lambda h=hidden: _pouring(h) for name, hidden in SIZES.items()
+}
 
 
 @cache

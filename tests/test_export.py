@@ -1,6 +1,5 @@
 """Planners in C: strict compilers and sanitizers have nothing to say, and they plan as `solve` does."""
 
-
 import numpy as np
 import pytest
 from exported_hosts import CXX, C, identifier, run

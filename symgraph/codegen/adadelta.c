@@ -161,9 +161,9 @@ static void optimize(Planner *p) {
 #endif
       judged = run;
 #if REQUIREMENTS
-      end_search(p, &judged, knowledge_of(p, run.choices));
+      if (!end_search(p, &judged, knowledge_of(p, run.choices))) return;
 #else
-      end_search(p, &judged, 0);
+      if (!end_search(p, &judged, 0)) return;
 #endif
       if (run.outcome == CONVERGED || ((run.outcome == ITERATION_LIMIT || run.outcome == OSCILLATION) &&
                                        (!finished || !isfinite(best.value) || run.value > best.value))) {

@@ -70,6 +70,18 @@ static int has_spent(const Planner *p, double share) {
 #define EQUAL 1e-12
 #endif
 
+/* Whether there is time for something that takes as long as so many evaluations. */
+static int has_time_for(const Planner *p, double evaluations) {
+  const planner_options *o = p->options;
+  double spent;
+  if (!(o->seconds > 0) || p->plan->evaluations == 0) return 1;
+  spent = o->clock(o->user) - p->began;
+  return spent + evaluations * spent / (double) p->plan->evaluations < o->seconds;
+}
+
+/* Whether the order of searches matters, since there may not be time for all. */
+static int is_limited(const Planner *p) { return p->options->seconds > 0 || p->options->evaluations > 0; }
+
 /* Whether one result is better than another: it misses less, or as much and its value is higher. Values that differ by rounding
    alone are equal, so that of two searches the same one is taken on all machines. */
 static int is_better(double value, double missed, double other_value, double other_missed) {

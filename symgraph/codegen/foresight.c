@@ -61,6 +61,7 @@ static void settle(Planner *p) {
     }
     if (!best || !may_go_on(p)) return;
     if (!best->told) {
+      if (!has_time_for(p, FORESIGHT)) return;
       look_ahead(p, best->x, best->choices);
       worth = p->foresight.values[0] - (RISK != 0 ? RISK * sqrt(larger(p->foresight.spreads[0], 0)) : 0);
       rounding = TOLD * fabs(best->value) + TOLD_SCALE * best->scale;

@@ -53,6 +53,18 @@ static int improve(Planner *p, struct ended best) {
 }
 
 #endif
+/* The start that is next, or -1: the first one that waits, or the most promising one where there may not be time for all. */
+static int next_start(const Planner *p) {
+  const struct start *starts = p->room.starts;
+  int i, next = -1;
+  for (i = 0; i < MOST_GUESSES + MOST_STARTS; ++i)
+    if (starts[i].used && (next < 0 || comes_before(starts + i, starts + next))) {
+      next = i;
+      if (i < MOST_GUESSES || !is_limited(p)) break; /* what the caller suggests comes first */
+    }
+  return next;
+}
+
 static void optimize(Planner *p) {
   struct room *const room = &p->room;
   int i;
@@ -60,9 +72,9 @@ static void optimize(Planner *p) {
   find_promising(p, STARTS, SAMPLES);
   add_guesses(p);
   room->ended_count = 0;
-  for (i = 0; i < MOST_GUESSES + MOST_STARTS && may_go_on(p); ++i) {
+  while (may_go_on(p) && (i = next_start(p)) >= 0) {
     struct ended made;
-    if (!room->starts[i].used) continue;
+    room->starts[i].used = 0;
     ++p->plan->starts;
     if (!climb_from(p, room->starts[i].x, room->starts[i].choices, TOLERANCE, ITERATIONS, &made)) return;
 #if IMPROVES

@@ -8,13 +8,15 @@
 #define FIRST_TOLERANCE 1e-2 /* of a climb; the multipliers are not right yet */
 
 /* The largest breach of what counts at a point where a search has ended, and 0 where moves of the actions that rounding hides
-   would make up for it; -1 for NaN. Leaves J there, the breach as it is, and whose it is. */
+   would make up for it; -1 for NaN, or when the search had to end. Leaves J there, the breach as it is, and whose it is. */
 static double judged_breach(Planner *p, const double *x, const int *choices, const double *units, double *value,
                             double *violation, int *worst) {
   double *const found = p->room.found_breaches, *const slack = p->room.slack, *const moved = p->room.moved;
   double most = 0;
   int i, k, missed = 0;
+  if (!may_go_on(p)) return -1;
   evaluate(p, x, choices);
+  ++p->plan->evaluations;
   *value = p->value;
   *violation = 0;
   *worst = -1;
@@ -29,8 +31,10 @@ static double judged_breach(Planner *p, const double *x, const int *choices, con
   copy_actions(moved, x);
   for (i = 0; i < N_ACTIONS; ++i) {
     const double low = lower[i], high = upper[i];
+    if (!may_go_on(p)) return -1;
     moved[i] += (x[i] > (low + high) / 2 ? -1 : 1) * MOVE * (high - low);
     evaluate(p, moved, choices);
+    ++p->plan->evaluations;
     for (k = 0; k < N_MARGINS; ++k) {
       const double change = fabs(p->margins[k] - p->room.at_end[k]);
       if (isfinite(change)) slack[k] += change;

@@ -41,8 +41,8 @@ static void keep_done(struct room *room, const struct ended *made) {
   room->done[i] = *made;
 }
 
-/* Judge where a walk has ended, and keep it. */
-static void end_search(Planner *p, struct ended *made, const struct known *here) {
+/* Judge where a walk has ended, and keep it. Returns 0 if the search had to end before. */
+static int end_search(Planner *p, struct ended *made, const struct known *here) {
   struct room *const room = &p->room;
   const planner_options *o = p->options;
   planner_plan *plan = p->plan;
@@ -50,6 +50,7 @@ static void end_search(Planner *p, struct ended *made, const struct known *here)
   if (isfinite(made->value)) {
     made->missed = judged_breach(p, made->x, made->choices, here->units, &made->value, &made->violation,
                                  &made->worst);
+    if (p->over) return 0;
   }
 #else
   (void) here;
@@ -72,6 +73,7 @@ static void end_search(Planner *p, struct ended *made, const struct known *here)
   plan->tried = room->tried_count;
   made->told = 0;
   if (isfinite(made->value) && made->missed >= 0) keep_done(room, made);
+  return 1;
 }
 
 /* Climb from a point by L-BFGS. Returns 0 if it had to end. */
@@ -94,6 +96,5 @@ static int climb_from(Planner *p, const double *x, const int *choices, double to
   made->value = walk->value;
   made->outcome = walk->outcome;
   made->scale = here->scale;
-  end_search(p, made, here);
-  return 1;
+  return end_search(p, made, here);
 }

@@ -44,7 +44,9 @@ def planner_source(description: Description, programs: Programs, settings: Setti
     for name in ("early", "forward", "backward", "foresee"):
         names[name], room = writer.function(getattr(programs, name), False, False)
         work = max(work, room)
+    costs = writer.costs
     macros = _numbers(description, programs, work, len(weights)) | settings.macros
+    macros["FORESIGHT"] = round(costs.of_program(programs.foresee) / max(costs.of_program(programs.forward), 1.0), 3)
     flags = settings.flags | {
         "REQUIREMENTS": bool(description.demands),
         "UNCERTAIN": any(slot.uncertain for slot in description.given),

@@ -150,7 +150,7 @@ class Costs:
         self._shares: dict[Program, Shares] = {}
 
     def of(self, operation: Operation) -> float:
-        if operation.code in ("product", "packed product", "packed pair"):
+        if operation.code in ("product", "weighted product", "packed product", "packed pair"):
             m, k = operation.detail[:2]
             return float(m * k * (2 if operation.code == "packed pair" else operation.detail[2]))
         if operation.code in CALLS:

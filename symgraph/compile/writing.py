@@ -15,6 +15,7 @@ from symgraph.compile.meetings import Meetings
 from symgraph.compile.program import CALLS, Indices, Operation, Program, Value, constant_of
 from symgraph.compile.schedule import Schedule, Step
 from symgraph.compile.sharing import PARTS, Costs
+from symgraph.errors import CompileError
 
 PART = 1000  # operations of one C function: the compiler's time grows faster than a function's length
 MOST_RUNS = 12  # copies that are written out; beyond that a table says what goes where
@@ -82,7 +83,16 @@ class Writer:
         return self._tables[key]
 
     def external(self, function: ca.Function) -> ca.Function:
-        """Return the function under whose name CasADi's code is called."""
+        """Return the function under whose name CasADi's code is called.
+
+        Raises:
+            CompileError: that code is no strict standard C.
+        """
+        if self.plain:
+            raise CompileError(
+                f"{function.name()!r} is or calls a lookup table, a solver or a callback of CasADi's, which cannot be "
+                f"written as standard C; write what it does as an expression, or fit a network to it"
+            )
         key = hash(function)
         if key not in self._externals:
             inputs, name = function.mx_in(), f"external_{len(self._externals)}"
