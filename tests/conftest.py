@@ -10,6 +10,12 @@ pytest_plugins = ["pytester"]
 
 # What it is: (commands, of which one will do; how to get it).
 REQUIRED_TOOLS = {"C compiler": (("cc", "gcc", "clang"), "apt-get install gcc libc6-dev")}
+# What generated C is tried with besides, where it is there; CI has it all.
+CI_TOOLS = {
+    "C++ compiler": (("g++",), "apt-get install g++"),
+    "second C compiler": (("clang",), "apt-get install clang"),
+    "memory checker": (("valgrind",), "apt-get install valgrind"),
+}
 
 # Packages that only some tests import, and the extra of pyproject.toml that brings each.
 OPTIONAL_PACKAGES = {
@@ -34,7 +40,8 @@ settings.load_profile("symgraph")
 
 
 def pytest_configure(config):
-    for tool, (commands, remedy) in REQUIRED_TOOLS.items():
+    required = REQUIRED_TOOLS | (CI_TOOLS if os.environ.get("SYMGRAPH_CI") else {})
+    for tool, (commands, remedy) in required.items():
         if not any(shutil.which(command) for command in commands):
             raise pytest.UsageError(f"the tests need a {tool} ({' or '.join(commands)}): {remedy}")
 

@@ -1,6 +1,7 @@
 """Programs in C around generated planners, built with what finds faults, and run."""
 
 import re
+import shutil
 import subprocess
 
 import numpy as np
@@ -10,6 +11,13 @@ import symgraph as sg
 
 STRICT = ("-Wall", "-Wextra", "-Werror", "-pedantic")
 C, CXX = ("-std=c99", *STRICT), ("-x", "c++", "-std=c++17", *STRICT)
+# Those that are here; CI has them all.
+COMPILERS = {
+    name: (name, *flags)
+    for name, flags in {"gcc": C, "clang": C, "g++": CXX, "clang++": CXX}.items()
+    if shutil.which(name)
+}
+CC = next(name for name in ("gcc", "cc", "clang") if shutil.which(name))
 SANITIZERS = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer")
 
 
@@ -31,7 +39,7 @@ def run(*command, status=0, **options):
     return done.stdout
 
 
-def built(folder, name, program, target, *flags, compiler=("gcc", *C)):
+def built(folder, name, program, target, *flags, compiler=(CC, *C)):
     """Build a program, whose names begin with `planner_`, with a planner of a folder; return where it is."""
     text = re.sub(r"\bplanner_", f"{name}_", re.sub(r"\bPLANNER_", f"{name.upper()}_", program))
     source = target.with_suffix(".c")

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from exported_hosts import CXX, C, identifier, run
+from exported_hosts import CC, COMPILERS, C, identifier, run
 from exported_tasks import random_point, situations, stacked, task
 
 import symgraph as sg
 
-COMPILERS = {"gcc": ("gcc", *C), "clang": ("clang", *C), "g++": ("g++", *CXX), "clang++": ("clang++", *CXX)}
 LARGE = ["pouring 2x32", "pouring 3x200"]
 TASKS = ["cannon", "push", "toss", *(pytest.param(name, marks=pytest.mark.slow) for name in LARGE)]
 CLOSE = 1e-9  # values, relative
@@ -44,7 +43,7 @@ def test_strict_compilers_have_nothing_to_say(exported, name, options, compiler,
 @pytest.mark.parametrize(
     "optimizer", [sg.Adadelta(), sg.Adadelta.paper(), sg.Enumerate(), sg.Lbfgs(starts=1)], ids=repr
 )
-@pytest.mark.parametrize("compiler", ["gcc", "clang++"])
+@pytest.mark.parametrize("compiler", COMPILERS)
 def test_every_optimizer_compiles(compiler, optimizer, tmp_path):
     objective, _ = task("cannon")
     sg.export_c(objective, tmp_path, name="aim", optimizer=optimizer)
@@ -53,7 +52,7 @@ def test_every_optimizer_compiles(compiler, optimizer, tmp_path):
 
 def test_it_needs_the_librarys_mathematics_alone(exported, tmp_path):
     folder = exported("toss", weights="file")
-    run("gcc", *C, "-O2", "-c", folder / "toss.c", "-o", tmp_path / "made.o")
+    run(CC, *C, "-O2", "-c", folder / "toss.c", "-o", tmp_path / "made.o")
     symbols = [line.split() for line in run("nm", tmp_path / "made.o").splitlines()]
     wanted = {parts[-1] for parts in symbols if parts[-2] == "U"}
     assert wanted <= {
