@@ -3,56 +3,31 @@
 from __future__ import annotations
 
 import ctypes
-import hashlib
-import json
 import math
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn, get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from symgraph.codegen.ctypes_of import Structures, array_of
-from symgraph.codegen.description import FORMAT, Description, StateSlot
-from symgraph.codegen.header import STATUSES
-from symgraph.compile import toolchain
+from symgraph.codegen.description import StateSlot
+from symgraph.codegen.library import Library
 from symgraph.compile.kernel import Outcome
-from symgraph.errors import CompileError, InputError, SolveError, StorageError, did_you_mean, names
+from symgraph.errors import InputError, SolveError, did_you_mean, names
 from symgraph.objective import checked_column
 from symgraph.optimizers.settings import number, positive_whole
 from symgraph.outcomes import NodeOutcome
 from symgraph.plan import Plan, PlanRun
 from symgraph.slots import Array, Gaussian, unchecked_gaussian
 
-OK, TIME_LIMIT, EVALUATION_LIMIT, INTERRUPTED, NO_PLAN = 0, 1, 2, 3, -1
+TIME_LIMIT, EVALUATION_LIMIT, INTERRUPTED, NO_PLAN = 1, 2, 3, -1  # of the header's statuses
 MOST_RUNS = 4096  # that a plan tells of
 LOOK = 0.05  # [s] between looks at whether Ctrl-C was pressed
 
-FLAGS = ("-fPIC", "-std=c99", "-O3", "-march=native", "-ffp-contract=off", "-fno-math-errno")
-# It calls functions of its own with the upper halves of vector registers in use unless it is told not to, and what they
-# call of the C library takes twice as long.
-GCC_FLAGS = ("-fno-ipa-ra",)
-
 _OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)  # in the order of walks.c
-_MESSAGES = {code: told for _, code, told in STATUSES}
-
-# A clock, and a way to end a search from another thread: in C, since both are asked before each evaluation.
-_SHIM = """
-#include <time.h>
-double symgraph_clock(void *user) {
-  struct timespec now;
-  (void) user;
-  clock_gettime(CLOCK_MONOTONIC, &now);
-  return (double) now.tv_sec + 1e-9 * (double) now.tv_nsec;
-}
-int symgraph_progress(void *user, const planner_plan *best) {
-  (void) best;
-  return *(const volatile int *) user;
-}
-"""
 
 
 class CPlanner:
@@ -70,14 +45,9 @@ class CPlanner:
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
-        self.description = _read(self.folder)
-        self.name = self.description.name
+        self._library = Library(self.folder)
+        self.description = self._library.description
         self._structures = Structures(self.description)
-        self._code = _compiled(self.folder, self.description)
-        self._weights = self._read_weights()
-        self._spare: list[tuple[Array, ctypes.c_void_p]] = []
-        with self._planner():  # what is wrong with the weights is told here
-            pass
 
     def solve(
         self,
@@ -126,8 +96,8 @@ class CPlanner:
             evaluations=evaluations or 0,
             # No time at all is as little as there can be; 0 is no limit.
             seconds=0.0 if time_limit is None else max(float(time_limit), 1e-12),
-            clock=ctypes.cast(self._code.symgraph_clock, ctypes.c_void_p),
-            progress=ctypes.cast(self._code.symgraph_progress, ctypes.c_void_p),
+            clock=self._library.address("clock"),
+            progress=self._library.address("progress"),
             user=ctypes.addressof(stop),
             starts=ctypes.addressof(starts),
             start_count=len(guesses),
@@ -138,16 +108,14 @@ class CPlanner:
         column, plan = self._state(state), made.plan()
 
         def search() -> int:
-            with self._planner() as planner:
-                return int(self._function("solve")(planner, column, ctypes.byref(options), ctypes.byref(plan)))
+            with self._library.planner() as planner:
+                return self._library.call("solve", planner, column, ctypes.byref(options), ctypes.byref(plan))
 
         status = _interruptible(search, stop)
         if status == NO_PLAN:
             raise SolveError(
                 "no start point has a finite value; look for square roots and divisions at 0 in the models"
             )
-        if status < OK:
-            self._refuse(status)
         actions, selections = self._labelled(plan.actions), self._chosen(plan.selections)
         return Plan(
             actions=actions,
@@ -280,17 +248,13 @@ class CPlanner:
         *results: Any,
     ) -> None:
         point, column = self._complete(actions, selections), self._state(state)
-        with self._planner() as planner:
-            status = self._function(name)(planner, column, point.actions, point.selections, *results)
-        if status < OK:
-            self._refuse(status)
+        with self._library.planner() as planner:
+            self._library.call(name, planner, column, point.actions, point.selections, *results)
 
     def _outcomes(self, state: Any, actions: Any, selections: Any) -> list[NodeOutcome]:
         d, out = self.description, self._structures.outcomes()
-        with self._planner() as planner:
-            status = self._function("foresee")(planner, state, actions, selections, ctypes.byref(out))
-        if status < OK:
-            self._refuse(status)
+        with self._library.planner() as planner:
+            self._library.call("foresee", planner, state, actions, selections, ctypes.byref(out))
         moments = array_of(out.moments)
         known: list[dict[str, Gaussian]] = []
         for i, node in enumerate(d.nodes):
@@ -350,89 +314,6 @@ class CPlanner:
         if plan.worst >= 0:
             missed = f"requirements are missed: {d.demands[plan.worst].told} by {plan.missed:.3g}; "
         return f"{missed}{heads.get(status, '')}{told}"
-
-    # the library
-
-    def _function(self, name: str) -> Any:
-        return getattr(self._code, f"{self.name}_{name}")
-
-    @contextmanager
-    def _planner(self) -> Iterator[ctypes.c_void_p]:
-        """Yield a planner that no other thread uses."""
-        try:
-            memory, planner = self._spare.pop()
-        except IndexError:
-            memory, planner = np.zeros(-(-self.description.memory // 8)), ctypes.c_void_p()
-            weights = [] if self._weights is None else [self._weights.ctypes.data, self._weights_bytes]
-            status = self._function("begin")(memory.ctypes.data, memory.nbytes, *weights, ctypes.byref(planner))
-            if status != OK:
-                self._refuse(status)
-        yield planner
-        self._spare.append((memory, planner))
-
-    def _read_weights(self) -> Array | None:
-        if self.description.weights_in != "file":
-            return None
-        try:
-            content = (self.folder / f"{self.name}.weights").read_bytes()
-        except OSError as error:
-            raise StorageError(f"CPlanner: the weights cannot be read: {error}; export the planner again") from error
-        self._weights_bytes = len(content)
-        numbers = np.zeros(-(-len(content) // 8) + 1)
-        numbers.view(np.uint8)[: len(content)] = np.frombuffer(content, np.uint8)
-        return numbers
-
-    def _refuse(self, status: int) -> NoReturn:
-        told = _MESSAGES[status].replace("PLANNER", self.name.upper()).replace("planner_", f"{self.name}_")
-        if status in (-12, -13, -14):
-            raise StorageError(f"CPlanner: {str(self.folder / self.name)!r}.weights: {told}; export the planner again")
-        raise InputError(f"{self.name}: {told}")
-
-
-def _read(folder: Path) -> Description:
-    try:
-        found = sorted(folder.glob("*.json"))
-        described = [json.loads(path.read_text(encoding="utf-8")) for path in found]
-        planners = [one for one in described if isinstance(one, dict) and {"format", "task", "writes"} <= set(one)]
-    except (OSError, ValueError) as error:
-        raise StorageError(f"CPlanner: {str(folder)!r} cannot be read: {error}; export the planner again") from error
-    if len(planners) != 1:
-        raise StorageError(
-            f"CPlanner: {str(folder)!r} holds {len(planners) or 'no'} planners; give a folder of export_c's"
-        )
-    if planners[0]["format"] != FORMAT:
-        raise StorageError(f"CPlanner: {str(folder)!r} was written by another version of symgraph; export it again")
-    try:
-        return Description.from_dict(planners[0])
-    except (TypeError, KeyError, AttributeError) as error:
-        raise StorageError(
-            f"CPlanner: the description in {str(folder)!r} is damaged: {error}; export it again"
-        ) from error
-
-
-def _compiled(folder: Path, description: Description) -> Any:
-    compiler = toolchain.find_compiler()
-    if compiler is None:
-        raise CompileError("CPlanner needs a C compiler: install one, e.g.  apt install gcc, or set CC")
-    name = description.name
-    try:
-        header, source = ((folder / f"{name}{end}").read_text(encoding="utf-8") for end in (".h", ".c"))
-    except OSError as error:
-        raise StorageError(f"CPlanner: {error}; export the planner again") from error
-    text = "#define _POSIX_C_SOURCE 199309L\n" + source.replace(f'#include "{name}.h"', header)
-    text += _SHIM.replace("planner_plan", f"{name}_plan")
-    key = hashlib.sha256(text.encode()).hexdigest()
-    code: Any = toolchain.load(key, lambda: [text], compiler, FLAGS + GCC_FLAGS * toolchain.is_gcc(compiler))
-    pointer: Any = ctypes.c_void_p
-    weights = [pointer, ctypes.c_size_t] if description.weights_in == "file" else []
-    getattr(code, f"{name}_begin").argtypes = [pointer, ctypes.c_size_t, *weights, pointer]
-    getattr(code, f"{name}_solve").argtypes = [pointer] * 4
-    getattr(code, f"{name}_value").argtypes = [pointer] * 5
-    getattr(code, f"{name}_gradient").argtypes = [pointer] * 6
-    getattr(code, f"{name}_foresee").argtypes = [pointer] * 5
-    if description.demands:
-        getattr(code, f"{name}_violation").argtypes = [pointer] * 5
-    return code
 
 
 def _interruptible(search: Any, stop: ctypes.c_int) -> int:
