@@ -31,9 +31,9 @@ def known(request):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_global_optimum_of(known, seed):
-    """With 64 starts, since Rastrigin's function has 121 minima in its box."""
+    """With 128 starts, since Rastrigin's function has 121 minima in its box."""
     function, objective = known
-    plan = sg.solve(objective, {}, sg.Lbfgs(starts=64) if function.name == "rastrigin" else None, seed=seed)
+    plan = sg.solve(objective, {}, sg.Lbfgs(starts=128) if function.name == "rastrigin" else None, seed=seed)
     assert -plan.value == pytest.approx(function.value, abs=1e-8)
     assert min(np.abs(plan.actions["u"] - place).max() for place in function.places) < 1e-4
 
@@ -137,7 +137,7 @@ def test_ctrl_c_in_compiled_code_keeps_the_finished_runs(monkeypatch, threads):
     plan = sg.solve(objective, {}, sg.Lbfgs(starts=60_000, samples=1, tolerance=0.0), threads=threads)
     assert 1 <= len(plan.runs) < 60_000
     assert plan.status == f"interrupted: best of {len(plan.runs)} runs"
-    assert plan.value == max(run.value for run in plan.runs)
+    assert plan.value == pytest.approx(max(run.value for run in plan.runs), rel=1e-12)  # the first of equals
 
 
 def test_threads_and_slices_of_time_change_nothing(monkeypatch):

@@ -110,7 +110,8 @@ class _BoundInterpreted(BoundKernel):
 
         def descend(u: Array) -> tuple[float, Array, bool]:
             value, gradient = self._at(place(u), selection)
-            gradient = -gradient * span
+            with np.errstate(invalid="ignore"):  # an infinite slope by what is held
+                gradient = -gradient * span
             return -value, gradient, bool(np.isfinite(value) and np.isfinite(gradient).all())
 
         span = self._high - self._low
