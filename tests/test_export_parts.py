@@ -2,11 +2,14 @@
 
 import json
 import re
+import signal
+import threading
 
 import casadi as ca
 import numpy as np
 import pytest
-from exported_tasks import task
+from exported_hosts import COMPILERS, run
+from exported_tasks import stacked, task
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -141,6 +144,7 @@ def test_numbers_of_weight_zero_have_no_part_even_with_infinite_slopes():
     [
         ({"name": "2 cannons"}, "give a C identifier, e.g. 'cannon'"),
         ({"name": "struct"}, "give a C identifier"),
+        ({"name": "n"}, "makes 'N_NODES', which stands for something else"),
         ({"optimizer": sg.Ipopt()}, "which needs a library; give Lbfgs"),
         ({"optimizer": sg.Enumerate(sg.Ipopt())}, "which needs a library; give Lbfgs"),
         ({"uncertain": ["targte"]}, "did you mean 'target'"),
@@ -236,8 +240,100 @@ def test_guesses_held_values_and_budgets(cannon):
         short.diagram()
 
 
+@pytest.mark.parametrize("evaluations", [20, 60, 150, 255])
+def test_a_budget_leaves_no_choice_out(cannon, evaluations):
+    objective, _ = task("cannon")
+    best = sg.solve(objective, STATE)
+    made = cannon.solve(STATE, evaluations=evaluations)
+    assert made.selections == best.selections
+    assert made.value >= best.value - 1e-3
+    assert made.status.startswith("evaluation limit: ")
+
+
+@pytest.mark.parametrize("evaluations", [1, 2, 5, 40])
+def test_with_any_budget_a_guess_is_looked_at(cannon, evaluations):
+    objective, _ = task("cannon")
+    best = sg.solve(objective, STATE)
+    assert cannon.solve(STATE, evaluations=evaluations, guess=best).value >= best.value - 1e-12
+
+
+def test_ctrl_c_ends_a_search(tmp_path):
+    slots = {"x": sg.Action(30, low=-2.0, high=2.0)}
+    graph = sg.Graph(slots, start="a")
+    graph.reward("a", lambda x: -ca.sumsqr(ca.sin(7 * x) * x) - 0.1 * ca.sumsqr(x[1:] - x[:-1] ** 2))
+    objective = sg.Objective(sg.unroll(graph))
+    planner = sg.CPlanner(sg.export_c(objective, tmp_path, name="lasting", optimizer=sg.Lbfgs(starts=20_000)))
+    threading.Timer(0.5, signal.raise_signal, [signal.SIGINT]).start()
+    plan = planner.solve({})
+    assert plan.status.startswith("interrupted: best of ")
+    assert np.isfinite(plan.value)
+
+
+# Tasks without some of what tasks have
+
+PLAIN = {
+    "x": sg.Action(low=-1.0, high=1.0),
+    "y": sg.State(),
+    "s": sg.Selection(["p", "q"]),
+    "one": sg.Selection(["only"]),
+}
+
+
+def without_states():
+    graph = sg.Graph(PLAIN, start="a")
+    graph.edge("a", "b", lambda x: {"y": x})
+    graph.reward("b", lambda y: -((y - 0.3) ** 2))
+    return graph, {}
+
+
+def without_actions():
+    graph = sg.Graph({key: PLAIN[key] for key in ("y", "s", "one")}, start="a")
+    graph.choose("a", "s", {"p": ("b", lambda y: {"y": y + 1}), "q": ("b", lambda y: {"y": y - 1})})
+    graph.choose("b", "one", {"only": ("c", None)})
+    graph.reward("c", lambda y: -(y**2))
+    return graph, {"y": 0.4}
+
+
+def without_decisions():
+    graph = sg.Graph({"y": sg.State()}, start="a")
+    graph.reward("a", lambda y: -(y**2))
+    return graph, {"y": 0.4}
+
+
+def with_odd_words():
+    slots = {
+        "class": sg.Action(low=-1.0, high=1.0, unit='m "/*%d*/ ??/'),
+        "Größe": sg.State(unit="°C"),
+        "x_covariance": sg.State(),
+        "x": sg.State(),
+        "int": sg.Selection(["%s", 'a"b', "*/", "\\", "for"]),
+    }
+    graph = sg.Graph(slots, start="a")
+    ways = dict.fromkeys(slots["int"].choices, ("b", None))
+    graph.choose("a", "int", ways)
+    graph.reward(
+        "b", sg.Model(lambda a, b, c, d: -((a - b * c) ** 2) + d, rename=dict(zip("abcd", slots, strict=False)))
+    )
+    return graph, {"Größe": 0.5, "x_covariance": 1.0, "x": sg.Gaussian(0.1, 0.01)}
+
+
+@pytest.mark.parametrize("level", ["-O0", "-O2"])
+@pytest.mark.parametrize("made", [without_states, without_actions, without_decisions, with_odd_words])
+def test_tasks_without_some_of_what_tasks_have(made, level, tmp_path):
+    graph, state = made()
+    objective = sg.Objective(sg.unroll(graph))
+    folder = sg.export_c(objective, tmp_path, name="task", uncertain=["x"] if "x" in state else [])
+    for name, compiler in COMPILERS.items():
+        run(*compiler, level, "-c", folder / "task.c", "-o", tmp_path / f"{name}.o")
+        run(*compiler, level, "-c", folder / "main.c", "-o", tmp_path / f"{name}.o")
+    plan, found = sg.CPlanner(folder).solve(state), sg.solve(objective, state)
+    assert plan.value == pytest.approx(found.value, abs=1e-12)
+    assert plan.selections == found.selections
+    assert stacked(plan.actions) == pytest.approx(stacked(found.actions), abs=1e-6)
+
+
 def test_a_folder_without_a_planner(tmp_path, cannon):
-    with pytest.raises(sg.StorageError, match="holds no planners"):
+    with pytest.raises(sg.StorageError, match="holds no planner; give a folder"):
         sg.CPlanner(tmp_path)
     described = json.loads((cannon.folder / "cannon.json").read_text())
     (tmp_path / "cannon.json").write_text(json.dumps({**described, "format": 99}))

@@ -147,7 +147,7 @@ def test_a_plan_travels(plan, how):
 def test_a_plan_from_another_process_can_be_a_guess_but_not_drawn(solved):
     objective, state, plan = solved
     there = pickle.loads(pickle.dumps(plan))
-    refuses(there.diagram, sg.GraphError, "another process", "draw it where it was made")
+    refuses(there.diagram, sg.GraphError, "another process", "draw one of solve's own")
     assert there._repr_svg_() is None
     again = sg.solve(objective, state, sg.Ipopt(), guess=there)
     assert again.value >= plan.value - 1e-9

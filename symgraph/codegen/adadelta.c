@@ -137,10 +137,13 @@ static int move(Planner *p, struct ended *run, long limit) {
 static void optimize(Planner *p) {
   struct room *const room = &p->room;
   struct ended best;
-  int waiting = fill_queue(p), finished = 0, i;
-  const int wanted = FINISHED > 0 ? FINISHED : waiting;
-  const long total = TOTAL_ITERATIONS > 0 ? TOTAL_ITERATIONS : (long) waiting * RUN_ITERATIONS;
-  long spent = 0;
+  int waiting, finished = 0, i;
+  int wanted;
+  long total, spent = 0;
+  begin_round(p);
+  waiting = fill_queue(p);
+  wanted = FINISHED > 0 ? FINISHED : waiting;
+  total = TOTAL_ITERATIONS > 0 ? TOTAL_ITERATIONS : (long) waiting * RUN_ITERATIONS;
 #if POLISH
   room->polish_count = 0;
 #endif

@@ -6,7 +6,8 @@ import ctypes
 import math
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, get_args
 
@@ -25,7 +26,6 @@ from symgraph.slots import Array, Gaussian, unchecked_gaussian
 
 TIME_LIMIT, EVALUATION_LIMIT, INTERRUPTED, NO_PLAN = 1, 2, 3, -1  # of the header's statuses
 MOST_RUNS = 4096  # that a plan tells of
-LOOK = 0.05  # [s] between looks at whether Ctrl-C was pressed
 
 _OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)  # in the order of walks.c
 
@@ -37,17 +37,19 @@ class CPlanner:
 
     Args:
         folder: what `export_c` returned.
+        name: of the planner, if the folder holds several.
 
     Raises:
         StorageError: no planner is there, several are, or a file of it is damaged.
         CompileError: there is no C compiler, or it refused.
     """
 
-    def __init__(self, folder: str | Path) -> None:
+    def __init__(self, folder: str | Path, name: str | None = None) -> None:
         self.folder = Path(folder)
-        self._library = Library(self.folder)
+        self._library = Library(self.folder, name)
         self.description = self._library.description
         self._structures = Structures(self.description)
+        self._worker: ThreadPoolExecutor | None = None  # kept: to begin a thread can take longer than to plan
 
     def solve(
         self,
@@ -111,7 +113,7 @@ class CPlanner:
             with self._library.planner() as planner:
                 return self._library.call("solve", planner, column, ctypes.byref(options), ctypes.byref(plan))
 
-        status = _interruptible(search, stop)
+        status = self._interruptible(search, stop)
         if status == NO_PLAN:
             raise SolveError(
                 "no start point has a finite value; look for square roots and divisions at 0 in the models"
@@ -126,7 +128,7 @@ class CPlanner:
             notes=self.description.notes,
             nodes=self._outcomes(column, plan.actions, plan.selections),
             runs=[self._run(run) for run in runs[: min(plan.runs, MOST_RUNS)]],
-            optimizer=f"{self.description.optimizer} in C",
+            optimizer=f"{self.description.optimizer} in C ({plan.evaluations} evaluations)",
             seed=int(seed),
             seconds=time.perf_counter() - begin,
             units=self.description.units,
@@ -175,6 +177,19 @@ class CPlanner:
         """Return what happens at every node, as `Objective.outcomes` does."""
         point = self._complete(actions, selections)
         return self._outcomes(self._state(state), point.actions, point.selections)
+
+    def _interruptible(self, search: Callable[[], int], stop: ctypes.c_int) -> int:
+        """Carry out a search so that Ctrl-C ends it early: no signal interrupts C."""
+        if threading.current_thread() is not threading.main_thread():
+            return search()
+        if self._worker is None:
+            self._worker = ThreadPoolExecutor(1, "symgraph")
+        task = self._worker.submit(search)
+        while True:
+            try:
+                return task.result()
+            except KeyboardInterrupt:
+                stop.value = 1
 
     # what C is given
 
@@ -314,32 +329,6 @@ class CPlanner:
         if plan.worst >= 0:
             missed = f"requirements are missed: {d.demands[plan.worst].told} by {plan.missed:.3g}; "
         return f"{missed}{heads.get(status, '')}{told}"
-
-
-def _interruptible(search: Any, stop: ctypes.c_int) -> int:
-    """Carry out a search so that Ctrl-C ends it early; it is C, which no signal interrupts."""
-    if threading.current_thread() is not threading.main_thread():
-        return int(search())
-    result: list[int | BaseException] = []
-
-    def run() -> None:
-        try:
-            result.append(search())
-        except BaseException as error:
-            result.append(error)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    while True:
-        try:
-            while thread.is_alive():
-                thread.join(LOOK)
-            break
-        except KeyboardInterrupt:
-            stop.value = 1
-    if isinstance(result[0], BaseException):
-        raise result[0]
-    return result[0]
 
 
 def _listed(guess: Any) -> list[Any]:

@@ -56,11 +56,21 @@ static int may_go_on(Planner *p) {
   return !p->over;
 }
 
-/* Whether a share of the budget is spent. */
+/* Begin a round of samples and searches: budgets are shared out anew. */
+static void begin_round(Planner *p) {
+  const planner_options *o = p->options;
+  p->round_evaluations = p->plan->evaluations;
+  p->round_seconds = o->seconds > 0 ? o->clock(o->user) - p->began : 0;
+}
+
+/* Whether a share of the budget that was left when the round began is spent. */
 static int has_spent(const Planner *p, double share) {
   const planner_options *o = p->options;
-  if (o->evaluations > 0 && (double) p->plan->evaluations >= share * (double) o->evaluations) return 1;
-  return o->seconds > 0 && o->clock(o->user) - p->began >= share * o->seconds;
+  if (o->evaluations > 0 && (double) (p->plan->evaluations - p->round_evaluations) >=
+                                share * (double) (o->evaluations - p->round_evaluations))
+    return 1;
+  return o->seconds > 0 &&
+         o->clock(o->user) - p->began - p->round_seconds >= share * (o->seconds - p->round_seconds);
 }
 
 #define SAME 1e-6 /* breaches that differ by less are equal */

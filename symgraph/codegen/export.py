@@ -9,9 +9,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
-from symgraph.codegen.description import Description, checked_name, describe
+from symgraph.codegen.description import checked_name, describe
 from symgraph.codegen.foresight import foresight
-from symgraph.codegen.header import header
+from symgraph.codegen.header import FUNCTIONS, header
+from symgraph.codegen.items import functions_in
 from symgraph.codegen.pages import build_file, main_program, manual
 from symgraph.codegen.programs import programs_of
 from symgraph.codegen.ros2 import copies, package_name, ros2_files
@@ -51,7 +52,7 @@ def export_c(
         optimizer: `Lbfgs()` if left out; else `Adadelta(…)`, or `Enumerate` of one of these.
         uncertain: start states that will come with a covariance; others are exact.
         precision: of the models' arithmetic, the objective's own if left out; "single" halves memory, and is for
-            processors that are slow at doubles. The search itself computes in double.
+            processors that are slow at doubles. The search itself computes in double, to a tolerance of 1e-5 at least.
         weights: of learned models and other parameters: "constants" of the C file, or a "file" that the program hands
             over, so that a model fitted anew needs no new build.
         ros2: write a ROS 2 package with a planning service too, to `ros2/<name>_planning`.
@@ -78,7 +79,7 @@ def export_c(
     labels = _uncertain(objective, uncertain)
     _warn_of_lacking(objective)
     sizes = tuple(slot.size for slot in objective.graph.selections().values())
-    settings = settings_of(optimizer, objective.n_actions, sizes)
+    settings = settings_of(optimizer, objective.n_actions, sizes, precision == "single")
     with Progress("writing C", progress) as bar:
         bar.wait("writing C")
         expectation = objective.build(labels).expectation
@@ -98,11 +99,13 @@ def export_c(
             notes=_notes(objective),
         )
         source = planner_source(description, programs, settings, numbers)
-        stack = stack_of(source.text, _own_stack(description))
+        stack = stack_of(source.text)
         description = description.with_sizes(source.task, len(numbers), source.memory, stack)
+        public, inside = _named(header(description), name), _named(source.text, name)
+        _check_clash(name, public, inside)
         files: dict[str, str | bytes] = {
-            f"{name}.h": _named(header(description), name),
-            f"{name}.c": _named(source.text, name),
+            f"{name}.h": public,
+            f"{name}.c": inside,
             "main.c": _named(main_program(description), name),
             "CMakeLists.txt": build_file(description),
             "README.md": _named(manual(description), name),
@@ -120,6 +123,10 @@ def export_c(
             path = folder / file
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        if weights != "file":
+            (folder / f"{name}.weights").unlink(
+                missing_ok=True
+            )  # of an earlier export: they would be taken for its own
     except OSError as error:
         raise StorageError(f"export_c cannot write to {str(folder)!r}: {error}; give another folder") from error
     return folder
@@ -154,11 +161,17 @@ def _notes(objective: Objective) -> list[str]:
     ]
 
 
-def _own_stack(d: Description) -> int:
-    """Return the bytes that a function of the search declares at most."""
-    n, s, k = sum(slot.size for slot in d.actions), len(d.selections), len(d.demands)
-    pointers = len(d.states) + 64
-    return 8 * (6 * (n + 1) + 2 * (k + 1) + pointers) + 4 * 4 * (s + 1) + 1024
+def _check_clash(name: str, public: str, source: str) -> None:
+    """Refuse a name with which public names would be those of something inside the C file."""
+    inside = set(functions_in(source)) | set(re.findall(r"^#define (\w+)", source, re.MULTILINE))
+    inside |= set(re.findall(r"^static const \w+ (\w+)", source, re.MULTILINE))
+    declared = set(re.findall(rf"\b(?:{name}|{name.upper()})_\w+", public))
+    own = {f"{name}_{function}" for function in FUNCTIONS} | {f"{name.upper()}_BEGIN_ARGUMENTS"}
+    clash = sorted((inside & declared) - own)
+    if clash:
+        raise InputError(
+            f"export_c: name = {name!r} makes {clash[0]!r}, which stands for something else; give another name"
+        )
 
 
 def _named(text: str, name: str) -> str:

@@ -8,6 +8,8 @@ from symgraph.codegen.description import Description, c_names
 
 NAMED_NODES = 200  # of a tree: nodes of larger ones have numbers only
 
+FUNCTIONS = ("begin", "solve", "value", "gradient", "violation", "foresee", "mean", "covariance", "message")
+
 OPTION_LINES = """\
 /* How to search; all of it may be 0. */
 typedef struct planner_options {
@@ -15,7 +17,7 @@ typedef struct planner_options {
   long evaluations;             /* budget: evaluations of the task; 0: no limit */
   double seconds;               /* budget by the clock [s]; 0: no limit */
   double (*clock)(void *user);  /* tells the time [s], from any moment on */
-  int (*progress)(void *user, const planner_plan *best); /* called before each evaluation; not 0 ends the search */
+  int (*progress)(void *user, const planner_plan *best); /* before each evaluation but the first; not 0 ends it */
   void *user;                   /* handed to clock and progress */
   const planner_point *starts;  /* start points to add; NAN: to be drawn, -1: to be chosen */
   int start_count;              /* at most PLANNER_MOST_STARTS */

@@ -75,7 +75,7 @@ int planner_begin(PLANNER_BEGIN_ARGUMENTS) {
 
 /* Begin a call: take in the state. */
 static int take_state(Planner *p, const planner_state *state) {
-  double numbers[N_STATE + 1];
+  double numbers[N_STATE + 1] = {0};
   int i;
 #if UNCERTAIN
   int c, j, size, begin;

@@ -65,21 +65,41 @@ static int next_start(const Planner *p) {
   return next;
 }
 
-static void optimize(Planner *p) {
+/* Climb from all starts that wait. Returns 0 if it had to end. */
+static int climb_all(Planner *p) {
   struct room *const room = &p->room;
   int i;
-  for (i = 0; i < MOST_GUESSES + MOST_STARTS; ++i) room->starts[i].used = 0;
-  find_promising(p, STARTS, SAMPLES);
-  add_guesses(p);
-  room->ended_count = 0;
   while (may_go_on(p) && (i = next_start(p)) >= 0) {
     struct ended made;
     room->starts[i].used = 0;
     ++p->plan->starts;
-    if (!climb_from(p, room->starts[i].x, room->starts[i].choices, TOLERANCE, ITERATIONS, &made)) return;
+    if (!climb_from(p, room->starts[i].x, room->starts[i].choices, TOLERANCE, ITERATIONS, &made)) return 0;
 #if IMPROVES
-    if (isfinite(made.value) && made.missed >= 0) room->ended[room->ended_count++] = made;
+    if (isfinite(made.value) && made.missed >= 0 && room->ended_count < MOST_GUESSES + MOST_STARTS)
+      room->ended[room->ended_count++] = made;
 #endif
+  }
+  return !p->over;
+}
+
+static void optimize(Planner *p) {
+  struct room *const room = &p->room;
+  int i;
+  for (i = 0; i < MOST_GUESSES + MOST_STARTS; ++i) room->starts[i].used = 0;
+  room->ended_count = 0;
+  begin_round(p);
+  if (is_limited(p)) { /* what the caller suggests comes first; and as long as samples had to be few, there are more rounds */
+    add_guesses(p);
+    if (!climb_all(p)) return;
+    do {
+      begin_round(p);
+      find_promising(p, STARTS, SAMPLES);
+      if (!climb_all(p)) return;
+    } while (p->cut_short && !ENUMERATES);
+  } else {
+    find_promising(p, STARTS, SAMPLES);
+    add_guesses(p);
+    if (!climb_all(p)) return;
   }
 #if IMPROVES
   if (combinations(p) > STARTS)

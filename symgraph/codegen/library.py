@@ -51,9 +51,9 @@ class Library:
         CompileError: there is no C compiler, or it refused.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, name: str | None = None) -> None:
         self._folder = folder
-        self.description = _read(folder)
+        self.description = _read(folder, name)
         self._name = self.description.name
         self._code = _compiled(folder, self.description)
         self._weights = self._read_weights()
@@ -113,17 +113,20 @@ class Library:
         raise InputError(f"{self._name}: {told}")
 
 
-def _read(folder: Path) -> Description:
+def _read(folder: Path, name: str | None) -> Description:
     try:
-        found = sorted(folder.glob("*.json"))
+        found = sorted(folder.glob("*.json" if name is None else f"{name}.json"))
         described = [json.loads(path.read_text(encoding="utf-8")) for path in found]
         planners = [one for one in described if isinstance(one, dict) and {"format", "task", "writes"} <= set(one)]
     except (OSError, ValueError) as error:
         raise StorageError(f"CPlanner: {str(folder)!r} cannot be read: {error}; export the planner again") from error
     if len(planners) != 1:
-        raise StorageError(
-            f"CPlanner: {str(folder)!r} holds {len(planners) or 'no'} planners; give a folder of export_c's"
+        held = (
+            f"{len(planners)} planners; say which one by name="
+            if planners
+            else "no planner; give a folder of export_c's"
         )
+        raise StorageError(f"CPlanner: {str(folder)!r} holds {held}")
     if planners[0]["format"] != FORMAT:
         raise StorageError(f"CPlanner: {str(folder)!r} was written by another version of symgraph; export it again")
     try:

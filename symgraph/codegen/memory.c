@@ -59,6 +59,9 @@ struct planner_planner {
   planner_plan *plan;             /* the best so far */
   int over;                       /* why the search has to end; 0 while it may go on */
   double began;                   /* [s] by the caller's clock */
+  double round_seconds;           /* of the budget that were spent when this round of samples began */
+  long round_evaluations;
+  int cut_short;                  /* whether the budget ended this round's samples */
   struct draws draws;
   double low[N_ACTIONS + 1], high[N_ACTIONS + 1];
   int held[N_SELECTIONS + 1]; /* the choice that is held, or -1 */

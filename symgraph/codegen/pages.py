@@ -11,10 +11,9 @@ from symgraph.codegen.header import STATUSES
 
 def build_file(d: Description) -> str:
     """Return CMakeLists.txt."""
-    weights = ' "${CMAKE_CURRENT_SOURCE_DIR}/' + f'{d.name}.weights"' if d.weights_in == "file" else ""
     return f"""\
 cmake_minimum_required(VERSION 3.16)
-project({d.name} C)
+project({d.name}_planner C)
 
 set(CMAKE_C_STANDARD 99)
 set(CMAKE_C_STANDARD_REQUIRED ON)
@@ -22,17 +21,16 @@ if(NOT CMAKE_BUILD_TYPE AND NOT CMAKE_CONFIGURATION_TYPES)
   set(CMAKE_BUILD_TYPE Release)
 endif()
 
-add_library({d.name} STATIC {d.name}.c)
-target_include_directories({d.name} PUBLIC "${{CMAKE_CURRENT_SOURCE_DIR}}")
+add_library({d.name}_planner STATIC {d.name}.c)
+target_include_directories({d.name}_planner PUBLIC "${{CMAKE_CURRENT_SOURCE_DIR}}")
 if(UNIX)
-  target_link_libraries({d.name} PUBLIC m)
+  target_link_libraries({d.name}_planner PUBLIC m)
 endif()
 
-add_executable({d.name}_main main.c)
-target_link_libraries({d.name}_main PRIVATE {d.name})
-
-enable_testing()
-add_test(NAME {d.name}_tells_its_use COMMAND {d.name}_main --help{weights})
+if(CMAKE_SOURCE_DIR STREQUAL CMAKE_CURRENT_SOURCE_DIR) # not as a part of another project
+  add_executable({d.name}_main main.c)
+  target_link_libraries({d.name}_main PRIVATE {d.name}_planner)
+endif()
 """
 
 
@@ -173,7 +171,7 @@ def _manual(d: Description) -> Iterator[str]:
     yield "## Build"
     yield ""
     yield f"Add `{d.name}.c` and `{d.name}.h` to your build; or add the folder with `add_subdirectory` and link"
-    yield f"`{d.name}`. On its own:"
+    yield f"`{d.name}_planner`. On its own:"
     yield ""
     yield "```console"
     yield "$ cmake -B build . && cmake --build build"

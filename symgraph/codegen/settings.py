@@ -15,6 +15,7 @@ MOST_TRIED = 1024  # combinations of selections that a search keeps in mind
 MOST_KNOWN = 64  # and of which it keeps how large differences of J are there
 MOST_DONE = 64  # searches that have ended, of which the best whose value is borne out counts
 SCALE_SAMPLES = 32
+FINEST_SINGLE = 1e-5  # tolerance, relative to differences of J
 SAMPLING = 0.25  # of a budget, after which no more samples are looked at
 MOST_COMBINATIONS = 1_000_000_001  # what more are counted as: beyond 10^9 selections are drawn one by one
 
@@ -38,11 +39,12 @@ class Settings:
     given: dict[str, Any]
 
 
-def settings_of(optimizer: Optimizer, n_actions: int, choices: tuple[int, ...]) -> Settings:
+def settings_of(optimizer: Optimizer, n_actions: int, choices: tuple[int, ...], single: bool) -> Settings:
     """Return how an optimizer searches.
 
     Args:
         optimizer: Lbfgs, Adadelta, or Enumerate with one of them.
+        single: whether J is computed in single precision.
         n_actions: numbers of stacked actions.
         choices: numbers of choices of the selections.
 
@@ -60,8 +62,11 @@ def settings_of(optimizer: Optimizer, n_actions: int, choices: tuple[int, ...]) 
         raise InputError(
             f"export_c: optimizer is {optimizer!r}, which needs a library; give Lbfgs(), Adadelta() or Enumerate(…)"
         )
+    if single:  # what rounding hides would be looked for to the last iteration
+        macros["TOLERANCE"] = max(macros["TOLERANCE"], FINEST_SINGLE)
     starts, samples = int(macros["MOST_STARTS"]), int(macros["SAMPLES"])
     flags["ENUMERATES"] = enumerates
+    macros["ENUMERATES"] = int(enumerates)
     flags["IMPROVES"] = isinstance(inner, Lbfgs) and combinations > inner.starts and not enumerates
     macros |= {
         "MOST_GUESSES": MOST_GUESSES,

@@ -8,7 +8,7 @@ static long more(long a, long b) { return a > b ? a : b; }
 static long fewer(long a, long b) { return a < b ? a : b; }
 
 /* The size of the differences of J that matter, from values of samples, which are sorted; 0 if too few are finite. */
-static double scale_from(double *values, int count) {
+static double scale_from(double *values, int count, int fewest) {
   int n = 0, i, j, gap = 1;
   double spread;
   for (i = 0; i < count; ++i)
@@ -20,7 +20,7 @@ static double scale_from(double *values, int count) {
       for (j = i; j >= gap && values[j - gap] > value; j -= gap) values[j] = values[j - gap];
       values[j] = value;
     }
-  if (n < FEWEST_SAMPLES) return 0;
+  if (n < fewest) return 0;
   spread = values[n - 1 - n / 4] - values[n / 4]; /* the middle half, or the whole range where there is a peak on a plain */
   if (spread == 0) spread = values[n - 1] - values[0];
   return spread == 0 ? 1 : spread;
@@ -45,14 +45,17 @@ static struct known *entry(Planner *p, const int *choices) {
 static struct known *knowledge_of(Planner *p, const int *choices) {
   struct room *const room = &p->room;
   struct known *const here = entry(p, choices);
-  int i, k;
+  int count = SCALE_SAMPLES, i, k;
   if (here->scale > 0) return here;
-  for (i = 0; i < SCALE_SAMPLES; ++i) {
+#if !REQUIREMENTS
+  if (is_limited(p)) count /= 4; /* a rough scale will do */
+#endif
+  for (i = 0; i < count; ++i) {
     const int looked = may_go_on(p) && look(p, room->typical + i * N_ACTIONS, choices);
     room->column[i] = looked ? p->value : -INFINITY;
     for (k = 0; k < N_MARGINS; ++k) room->margins[i * N_MARGINS + k] = looked ? p->margins[k] : NAN;
   }
-  here->scale = scale_from(room->column, SCALE_SAMPLES);
+  here->scale = scale_from(room->column, count, count / 2);
   if (here->scale == 0) here->scale = 1;
 #if REQUIREMENTS
   learn_units(choices, room->margins, room->column, here->units);
@@ -131,6 +134,7 @@ static int comes_before(const struct start *a, const struct start *b) {
 /* Sample the bounds under one combination of choices, and keep the most promising points: `each` of them in turn with those of
    other combinations, or those that are among the best of all. */
 static void sample(Planner *p, const int *choices, int count, int each, int group, int groups, int starts) {
+  const double share = SAMPLING * (group + 1) / groups; /* none must use up what is meant for others */
   struct room *const room = &p->room;
 #if REQUIREMENTS
   struct known *const here = knowledge_of(p, choices);
@@ -138,7 +142,11 @@ static void sample(Planner *p, const int *choices, int count, int each, int grou
   int looked = 0, r, i, e;
   double scale;
   spread_points(&p->draws, count, p->low, p->high, room->points, room->scratch, room->keys, room->order);
-  for (; looked < count && may_go_on(p) && (looked < each || !has_spent(p, SAMPLING)); ++looked) {
+  for (; looked < count && may_go_on(p); ++looked) {
+    if (looked > 0 && has_spent(p, share)) {
+      p->cut_short = 1;
+      break;
+    }
     room->order[looked] = looked;
     room->values[looked] = look(p, room->points + looked * N_ACTIONS, choices) ? p->value : -INFINITY;
     room->merits[looked] = room->values[looked];
@@ -150,7 +158,7 @@ static void sample(Planner *p, const int *choices, int count, int each, int grou
 #endif
   }
   if (looked == 0) return;
-  scale = scale_from(room->values, looked);
+  scale = scale_from(room->values, looked, FEWEST_SAMPLES);
   if (scale > 0) entry(p, choices)->scale = scale;
 #if REQUIREMENTS
   for (r = 0; r < looked; ++r) {
@@ -190,9 +198,13 @@ static void find_promising(Planner *p, int starts, int samples) {
   const int count = N_ACTIONS ? (int) more(each, fewer(each * samples, MOST_SAMPLES_OF_ONE)) : 1;
   struct room *const room = &p->room;
   int g;
+  p->cut_short = 0;
   draw_rows(p, groups, 1);
   for (g = 0; g < groups && may_go_on(p); ++g) {
-    if (g > 0 && has_spent(p, SAMPLING)) break;
+    if (groups > starts && g > 0 && has_spent(p, SAMPLING)) {
+      p->cut_short = 1;
+      break;
+    }
     sample(p, room->rows + g * N_SELECTIONS, count, each, g, groups, starts);
   }
 }
@@ -220,6 +232,7 @@ static void add_guesses(Planner *p) {
       if (p->held[s] >= 0) here->choices[s] = p->held[s];
       open |= here->choices[s] < 0;
     }
+    if (!open && is_limited(p) && may_go_on(p)) look(p, here->x, here->choices); /* no plan may be worse */
     if (!open) continue;
     best = *here;
     best.used = 0;
