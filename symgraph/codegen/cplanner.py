@@ -7,7 +7,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, get_args
 
@@ -25,6 +25,7 @@ from symgraph.plan import Plan, PlanRun
 from symgraph.slots import Array, Gaussian, unchecked_gaussian
 
 TIME_LIMIT, EVALUATION_LIMIT, INTERRUPTED, NO_PLAN = 1, 2, 3, -1  # of the header's statuses
+LOOK = 0.05  # [s] between looks at whether Ctrl-C was pressed: another thread may have got the signal
 MOST_RUNS = 4096  # that a plan tells of
 
 _OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)  # in the order of walks.c
@@ -187,7 +188,9 @@ class CPlanner:
         task = self._worker.submit(search)
         while True:
             try:
-                return task.result()
+                wait([task], LOOK)
+                if task.done():
+                    return task.result()
             except KeyboardInterrupt:
                 stop.value = 1
 

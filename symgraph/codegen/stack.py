@@ -27,7 +27,7 @@ def stack_of(text: str) -> int:
     bodies = functions_in(text)
 
     def frame(body: str) -> int:
-        pointers = sum(found.count(",") + 1 for found in _POINTERS.findall(body))
+        pointers: int = sum(found.count(",") + 1 for found in _POINTERS.findall(body))
         arrays = sum(8 * _count(length, macros) for length in _ARRAY.findall(body))
         copies = sum(structures.get(name, 0) for name in _COPY.findall(body))
         return FRAME + NUMBER * len(_NUMBERS.findall(body)) + 8 * pointers + arrays + copies
@@ -35,7 +35,8 @@ def stack_of(text: str) -> int:
     @cache
     def deepest(name: str) -> int:
         called = {word for word in _WORD.findall(bodies[name]) if word in bodies and word != name}
-        return frame(bodies[name]) + int(max(map(deepest, called), default=0))
+        below: int = max(map(deepest, called), default=0)
+        return frame(bodies[name]) + below
 
     return LIBRARY + max(map(deepest, bodies), default=0)
 
