@@ -145,7 +145,7 @@ static double memory[PLANNER_MEMORY / 8 + 1];
 static double tell(void *user) {
   struct timespec now;
   (void) user;
-  clock_gettime(CLOCK_MONOTONIC, &now);
+  clock_gettime(CLOCK_THREAD_CPUTIME_ID, &now); /* so that what the system gives to others does not count */
   return (double) now.tv_sec + 1e-9 * (double) now.tv_nsec;
 }
 /* For each state of a file: the time of a gradient and of a value, then value, time and evaluations of a plan. */
@@ -165,7 +165,7 @@ int main(int count, char **words) {
   options.clock = tell;
   options.seconds = seconds;
   for (;;) {
-    double began, gradient = 1e9, look = 1e9, spent;
+    double began, gradient, look, spent;
     int n;
     for (i = 0; i < COUNT; ++i)
       if (fscanf(file, "%lf", numbers + i) != 1) return 0;
@@ -173,14 +173,13 @@ int main(int count, char **words) {
     began = tell(0);
     if (planner_solve(planner, &state, &options, &plan) < 0) return 2;
     spent = tell(0) - began;
-    for (n = 0; n < 5; ++n) {
-      began = tell(0);
+    began = tell(0);
+    for (n = 0; n < 9; ++n)
       planner_gradient(planner, &state, &plan.actions, &plan.selections, &value, &slopes);
-      gradient = tell(0) - began < gradient ? tell(0) - began : gradient;
-      began = tell(0);
-      planner_value(planner, &state, &plan.actions, &plan.selections, &value);
-      look = tell(0) - began < look ? tell(0) - began : look;
-    }
+    gradient = (tell(0) - began) / 9;
+    began = tell(0);
+    for (n = 0; n < 9; ++n) planner_value(planner, &state, &plan.actions, &plan.selections, &value);
+    look = (tell(0) - began) / 9;
     printf("%.9g %.9g %.17g %.9g %ld %ld\\n", gradient, look, plan.value, spent, plan.evaluations, plan.gradients);
   }
 }

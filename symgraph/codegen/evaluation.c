@@ -43,13 +43,21 @@ static void differentiate(Planner *p) {
   for (i = 0; i < N_ACTIONS; ++i) p->gradient[i] = (double) p->slopes[i];
 }
 
+/* Whether there is no time for one more evaluation, which may take as long as the last ones did. */
+static int is_late(Planner *p) {
+  const double spent = p->options->clock(p->options->user) - p->began;
+  p->expected = larger(spent - p->spent, 0.9 * p->expected); /* the longest one, forgotten by and by: it may have been held up */
+  p->spent = spent;
+  return spent + p->expected >= p->options->seconds;
+}
+
 /* Whether the search may evaluate once more; the first time always. */
 static int may_go_on(Planner *p) {
   const planner_options *o = p->options;
   if (p->over || p->plan->evaluations == 0) return !p->over;
   if (o->evaluations > 0 && p->plan->evaluations >= o->evaluations)
     p->over = PLANNER_EVALUATION_LIMIT;
-  else if (o->seconds > 0 && o->clock(o->user) - p->began >= o->seconds)
+  else if (o->seconds > 0 && is_late(p))
     p->over = PLANNER_TIME_LIMIT;
   else if (o->progress && o->progress(o->user, p->plan))
     p->over = PLANNER_INTERRUPTED;
@@ -86,7 +94,7 @@ static int has_time_for(const Planner *p, double evaluations) {
   double spent;
   if (!(o->seconds > 0) || p->plan->evaluations == 0) return 1;
   spent = o->clock(o->user) - p->began;
-  return spent + evaluations * spent / (double) p->plan->evaluations < o->seconds;
+  return spent + (1 + evaluations) * spent / (double) p->plan->evaluations < o->seconds;
 }
 
 /* Whether the order of searches matters, since there may not be time for all. */

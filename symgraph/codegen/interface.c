@@ -157,12 +157,15 @@ static void search(Planner *p) {
 int planner_solve(planner_planner *p, const planner_state *state, const planner_options *options, planner_plan *plan) {
   planner_options none;
   struct room *room;
+  double began;
   int wrong, i, s;
   if (!p || !plan) return PLANNER_NULL;
   memset(&none, 0, sizeof none);
   if (!options) options = &none;
   wrong = check_options(options);
-  if (!wrong) wrong = take_state(p, state);
+  if (wrong) return wrong;
+  began = options->clock ? options->clock(options->user) : 0;
+  wrong = take_state(p, state);
   if (wrong) return wrong;
   memset(plan, 0, sizeof *plan);
   memset(&p->room, 0, sizeof p->room);
@@ -171,7 +174,8 @@ int planner_solve(planner_planner *p, const planner_state *state, const planner_
   p->plan = plan;
   p->over = 0;
   p->worst = -1;
-  p->began = options->clock ? options->clock(options->user) : 0;
+  p->began = began;
+  p->spent = p->expected = 0;
   for (i = 0; i < N_ACTIONS; ++i) {
     p->low[i] = lower[i];
     p->high[i] = upper[i];

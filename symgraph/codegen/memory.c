@@ -58,7 +58,7 @@ struct planner_planner {
   const planner_options *options; /* of the call under way, else 0 */
   planner_plan *plan;             /* the best so far */
   int over;                       /* why the search has to end; 0 while it may go on */
-  double began;                   /* [s] by the caller's clock */
+  double began, spent, expected;  /* [s] by the caller's clock: begin, at the last look, what an evaluation takes */
   double round_seconds;           /* of the budget that were spent when this round of samples began */
   long round_evaluations;
   int cut_short;                  /* whether the budget ended this round's samples */
