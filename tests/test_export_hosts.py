@@ -173,7 +173,8 @@ int main(void) {
   state.target[1] = 0.3;
   state.upper_muzzle[1] = 0.8;
   EXPECT(planner_begin(memory, 100, &none), PLANNER_MEMORY_TOO_SMALL);
-  EXPECT(planner_begin(memory + 1, PLANNER_MEMORY - 1, &none), PLANNER_MISALIGNED);
+  EXPECT(planner_begin(memory, PLANNER_MEMORY - 1, &none), PLANNER_MEMORY_TOO_SMALL);
+  EXPECT(planner_begin(memory + 1, PLANNER_MEMORY, &none), PLANNER_MISALIGNED);
   EXPECT(planner_begin(0, PLANNER_MEMORY, &none), PLANNER_NULL);
   EXPECT(planner_begin(memory, PLANNER_MEMORY, 0), PLANNER_NULL);
   memset(memory, 0, PLANNER_MEMORY);
@@ -226,7 +227,7 @@ int main(void) {
   EXPECT(planner_solve(planner, &state, &options, &plan), PLANNER_OPTION);
   options.evaluations = 3;
   EXPECT(planner_solve(planner, &state, &options, &plan), PLANNER_EVALUATION_LIMIT);
-  if (plan.evaluations != 3 || !plan.found) return 2;
+  EXPECT(plan.evaluations == 3 && plan.found ? 0 : 1000 + (int) plan.evaluations, 0);
   options.evaluations = 0;
   other = planner;
   options.progress = nested;

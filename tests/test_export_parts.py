@@ -144,6 +144,9 @@ def test_numbers_of_weight_zero_have_no_part_even_with_infinite_slopes():
     [
         ({"name": "2 cannons"}, "give a C identifier, e.g. 'cannon'"),
         ({"name": "struct"}, "give a C identifier"),
+        ({"name": "math"}, "is that of a file of C's; give another one, e.g. 'my_math'"),
+        ({"name": "Main"}, "is that of a file of C's"),
+        ({"name": "walk_on"}, "which stands for something else"),
         ({"name": "n"}, "makes 'N_NODES', which stands for something else"),
         ({"optimizer": sg.Ipopt()}, "which needs a library; give Lbfgs"),
         ({"optimizer": sg.Enumerate(sg.Ipopt())}, "which needs a library; give Lbfgs"),
@@ -205,6 +208,7 @@ STATE = {"speed": 3.0, "target": [1.3, 0.3], "lower_muzzle": [0.0, 0.0], "upper_
     ("state", "options", "words"),
     [
         ({}, {}, "state 'speed' is missing"),
+        ({**STATE, "junk": 1.0}, {}, "state 'junk' is not a slot"),
         ({**STATE, "speed": np.nan}, {}, "is not finite"),
         ({**STATE, "target": 1.0}, {}, "state 'target' has 1 elements, the slot has 2"),
         ({**STATE, "target": sg.Gaussian([1.3, 0.3], sd=[0.1, 0.1])}, {}, "export it with uncertain=['target']"),
@@ -240,7 +244,7 @@ def test_guesses_held_values_and_budgets(cannon):
         short.diagram()
 
 
-@pytest.mark.parametrize("evaluations", [20, 60, 150, 255])
+@pytest.mark.parametrize("evaluations", [60, 100, 150, 255])
 def test_a_budget_leaves_no_choice_out(cannon, evaluations):
     objective, _ = task("cannon")
     best = sg.solve(objective, STATE)

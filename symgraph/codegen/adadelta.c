@@ -19,7 +19,7 @@ static int fill_queue(Planner *p) {
     draw_rows(p, MOST_STARTS, 0);
 #endif
 #if SPREAD
-    spread_points(&p->draws, MOST_STARTS, p->low, p->high, room->points, room->scratch, room->keys, room->order);
+    spread_points(p, &p->draws, MOST_STARTS, p->low, p->high, room->points, room->scratch, room->keys, room->order);
 #endif
     for (i = 0; i < MOST_STARTS; ++i) {
       struct start *here = room->starts + MOST_GUESSES + i;
@@ -139,22 +139,23 @@ static void optimize(Planner *p) {
   struct ended best;
   int waiting, finished = 0, i;
   int wanted;
-  long total, spent = 0;
+  double total; /* of iterations; a long may be too short */
+  long spent = 0;
   begin_round(p);
   waiting = fill_queue(p);
   wanted = FINISHED > 0 ? FINISHED : waiting;
-  total = TOTAL_ITERATIONS > 0 ? TOTAL_ITERATIONS : (long) waiting * RUN_ITERATIONS;
+  total = TOTAL_ITERATIONS > 0 ? (double) TOTAL_ITERATIONS : (double) waiting * RUN_ITERATIONS;
 #if POLISH
   room->polish_count = 0;
 #endif
-  while (finished < wanted && waiting > 0 && spent < total) {
+  while (finished < wanted && waiting > 0 && (double) spent < total) {
 #if REQUEUE
     const int batch = 1;
 #else
-    const long affordable = (total - spent + RUN_ITERATIONS - 1) / RUN_ITERATIONS;
-    const int batch = (int) fewer(fewer(wanted - finished, affordable), waiting);
+    const double affordable = ceil((total - (double) spent) / RUN_ITERATIONS);
+    const int batch = (int) smaller(fewer(wanted - finished, waiting), affordable);
 #endif
-    const long limit = fewer(RUN_ITERATIONS, more(1, (total - spent) / batch));
+    const long limit = (long) smaller(RUN_ITERATIONS, larger(1, floor((total - (double) spent) / batch)));
     for (i = 0; i < batch; ++i) {
       struct ended run = take_next(p, &waiting, finished ? &best : 0), judged;
       if (!may_go_on(p) || !move(p, &run, limit)) return;

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+import os
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -26,6 +27,7 @@ from symgraph.slots import Array, Gaussian, unchecked_gaussian
 
 TIME_LIMIT, EVALUATION_LIMIT, INTERRUPTED, NO_PLAN = 1, 2, 3, -1  # of the header's statuses
 LOOK = 0.05  # [s] between looks at whether Ctrl-C was pressed: another thread may have got the signal
+MOST_EVALUATIONS = 2**31 - 1  # that a long holds anywhere
 MOST_RUNS = 4096  # that a plan tells of
 
 _OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)  # in the order of walks.c
@@ -50,7 +52,14 @@ class CPlanner:
         self._library = Library(self.folder, name)
         self.description = self._library.description
         self._structures = Structures(self.description)
-        self._worker: ThreadPoolExecutor | None = None  # kept: to begin a thread can take longer than to plan
+        self._worker: tuple[int, ThreadPoolExecutor] | None = (
+            None  # kept: to begin a thread can take longer than to plan
+        )
+
+    def __repr__(self) -> str:
+        d = self.description
+        given = names(slot.label for slot in d.given)
+        return f"CPlanner({str(self.folder)!r}: {d.name}, {d.optimizer}, {d.precision} precision, given {given})"
 
     def solve(
         self,
@@ -96,7 +105,7 @@ class CPlanner:
         stop = ctypes.c_int(0)
         options = made.options(
             seed=int(seed),
-            evaluations=evaluations or 0,
+            evaluations=min(evaluations or 0, MOST_EVALUATIONS),
             # No time at all is as little as there can be; 0 is no limit.
             seconds=0.0 if time_limit is None else max(float(time_limit), 1e-12),
             clock=self._library.address("clock"),
@@ -112,9 +121,16 @@ class CPlanner:
 
         def search() -> int:
             with self._library.planner() as planner:
-                return self._library.call("solve", planner, column, ctypes.byref(options), ctypes.byref(plan))
+                kept = starts, held, runs, stop  # options know their addresses only
+                status = self._library.call("solve", planner, column, ctypes.byref(options), ctypes.byref(plan))
+                del kept
+                return status
 
         status = self._interruptible(search, stop)
+        if status == NO_PLAN and stop.value:
+            raise KeyboardInterrupt
+        if status == NO_PLAN and (time_limit is not None or evaluations is not None):
+            raise SolveError("no point with a finite value was found within the limit; give more time or evaluations")
         if status == NO_PLAN:
             raise SolveError(
                 "no start point has a finite value; look for square roots and divisions at 0 in the models"
@@ -183,9 +199,9 @@ class CPlanner:
         """Carry out a search so that Ctrl-C ends it early: no signal interrupts C."""
         if threading.current_thread() is not threading.main_thread():
             return search()
-        if self._worker is None:
-            self._worker = ThreadPoolExecutor(1, "symgraph")
-        task = self._worker.submit(search)
+        if self._worker is None or self._worker[0] != os.getpid():  # a fork takes no threads with it
+            self._worker = os.getpid(), ThreadPoolExecutor(1, "symgraph")
+        task = self._worker[1].submit(search)
         while True:
             try:
                 wait([task], LOOK)
@@ -200,13 +216,11 @@ class CPlanner:
         given = self.description.given
         if not isinstance(state, Mapping):
             raise InputError(f"state is {type(state).__name__}; give {{label: number, array or Gaussian}}")
-        known = {slot.label for slot in self.description.states}
+        known = {*(slot.label for slot in self.description.states), *self.description.unread}
         needed = [slot.label for slot in given]
         for label in state:
-            if label not in known and did_you_mean(label, needed) != ".":
-                raise InputError(
-                    f"state {label!r} is no start state{did_you_mean(label, needed)} They are {names(needed)}"
-                )
+            if label not in known:
+                raise InputError(f"state {label!r} is not a slot{did_you_mean(label, needed)} States: {names(needed)}")
         for label in needed:
             if label not in state:
                 raise InputError(f"state {label!r} is missing; this planner needs {names(needed)}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+from importlib import metadata
 from typing import Any
 
 from symgraph.codegen.foresight import Write
@@ -18,6 +19,7 @@ FORMAT = 1  # of the description
 # Keywords of C and C++, and names that programs must not take.
 _C_WORDS = frozenset(
     """
+    NULL and_eq or_eq xor_eq not_eq dynamic_cast co_await co_return co_yield consteval constinit typeof linux unix
     alignas alignof and asm auto bitand bitor bool break case catch char char16_t char32_t char8_t class compl
     complex concept const constexpr continue decltype default delete do double else enum explicit export
     extern false float for friend goto if imaginary inline int long main mutable namespace new noexcept not
@@ -25,6 +27,14 @@ _C_WORDS = frozenset(
     signed sizeof static static_assert static_cast struct switch template this thread_local throw true try
     typedef typeid typename union unsigned using virtual void volatile wchar_t while xor
     """.split()  # noqa: SIM905 a list of them would be a page
+)
+
+
+_HEADERS = frozenset(
+    """
+    assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdalign stdarg stdatomic
+    stdbool stddef stdint stdio stdlib stdnoreturn string tgmath threads time uchar wchar wctype
+    """.split()  # noqa: SIM905
 )
 
 
@@ -109,6 +119,8 @@ class Description:
     moments: int
     demands: tuple[Demand, ...]
     most_starts: int
+    unread: tuple[str, ...] = ()  # states that nothing needs
+    version: str = ""
     task: int = 0
     weights: int = 0
     memory: int = 0
@@ -182,7 +194,7 @@ def describe(
     words = [*actions, *selections, *labels]
     fields = dict(zip(words, c_names([*taken, *words])[len(taken) :], strict=True))
     order = list(labels)
-    sizes = {label: slots[label].size for label in labels}
+    sizes = {label: int(slots[label].size) for label in labels}  # NumPy's numbers do not go into JSON
     places = [(w.node, order.index(w.label), w.mean, w.covariance) for w in writes]
     ends = [w.mean + sizes[w.label] + (sizes[w.label] ** 2 if w.covariance >= 0 else 0) for w in writes]
     return Description(
@@ -220,8 +232,17 @@ def describe(
         moments=max(ends, default=0),
         demands=tuple(_demand(objective, one) for one in expectation.constraints),
         most_starts=most_starts,
+        unread=tuple(label for label in objective.graph.states() if label not in labels),
+        version=_version(),
         notes=tuple(notes),
     )
+
+
+def _version() -> str:
+    try:
+        return metadata.version("symgraph")
+    except metadata.PackageNotFoundError:  # run from its folder, without being installed
+        return ""
 
 
 def _nodes(objective: Objective) -> tuple[Node, ...]:
@@ -262,6 +283,10 @@ def c_names(words: Iterable[str]) -> list[str]:
 
 def checked_name(name: object) -> str:
     """Return the prefix of all public names, or raise InputError."""
-    if isinstance(name, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) and name not in _C_WORDS:
-        return name
-    raise InputError(f"export_c: name = {name!r}; give a C identifier, e.g. 'cannon'")
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or name in _C_WORDS:
+        raise InputError(f"export_c: name = {name!r}; give a C identifier, e.g. 'cannon'")
+    if name.lower() in (*_HEADERS, "main"):  # name.h would be taken for the library's, Main.c for main.c
+        raise InputError(
+            f"export_c: name = {name!r} is that of a file of C's; give another one, e.g. 'my_{name.lower()}'"
+        )
+    return name

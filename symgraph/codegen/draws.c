@@ -67,11 +67,14 @@ static void sort_indices(int *indices, int count, const double *keys, int up) {
     }
 }
 
+/* Whether time is over, for what takes long between evaluations. */
+static int is_late(struct planner_planner *p);
+
 /* Points (count, N_ACTIONS) of a Latin hypercube between bounds (McKay, Beckman & Conover 1979). `scratch` has room for as
-   many numbers as points, `keys` and `order` for `count`. */
-static void spread_points(struct draws *d, int count, const double *low, const double *high, double *points, double *scratch,
-                          double *keys, int *order) {
-  int i, r;
+   many numbers as points, `keys` and `order` for `count`. When time is over the rest is not shuffled. */
+static void spread_points(struct planner_planner *p, struct draws *d, int count, const double *low, const double *high,
+                          double *points, double *scratch, double *keys, int *order) {
+  int late = 0, i, r;
   for (r = 0; r < count * N_ACTIONS; ++r) points[r] = uniform(d);
   for (r = 0; r < count * N_ACTIONS; ++r) scratch[r] = uniform(d);
   for (i = 0; i < N_ACTIONS; ++i) {
@@ -79,7 +82,8 @@ static void spread_points(struct draws *d, int count, const double *low, const d
       keys[r] = scratch[r * N_ACTIONS + i];
       order[r] = r;
     }
-    sort_indices(order, count, keys, 1);
+    late = late || is_late(p);
+    if (!late) sort_indices(order, count, keys, 1);
     for (r = 0; r < count; ++r) {
       double *x = points + r * N_ACTIONS + i;
       *x = low[i] + (high[i] - low[i]) * ((order[r] + *x) / count);

@@ -45,7 +45,9 @@ static void differentiate(Planner *p) {
 
 /* Whether there is no time for one more evaluation, which may take as long as the last ones did. */
 static int is_late(Planner *p) {
-  const double spent = p->options->clock(p->options->user) - p->began;
+  double spent;
+  if (!(p->options->seconds > 0)) return 0;
+  spent = p->options->clock(p->options->user) - p->began;
   p->expected = larger(spent - p->spent, 0.9 * p->expected); /* the longest one, forgotten by and by: it may have been held up */
   p->spent = spent;
   return spent + p->expected >= p->options->seconds;
@@ -57,7 +59,7 @@ static int may_go_on(Planner *p) {
   if (p->over || p->plan->evaluations == 0) return !p->over;
   if (o->evaluations > 0 && p->plan->evaluations >= o->evaluations)
     p->over = PLANNER_EVALUATION_LIMIT;
-  else if (o->seconds > 0 && is_late(p))
+  else if (is_late(p))
     p->over = PLANNER_TIME_LIMIT;
   else if (o->progress && o->progress(o->user, p->plan))
     p->over = PLANNER_INTERRUPTED;
@@ -95,6 +97,21 @@ static int has_time_for(const Planner *p, double evaluations) {
   if (!(o->seconds > 0) || p->plan->evaluations == 0) return 1;
   spent = o->clock(o->user) - p->began;
   return spent + (1 + evaluations) * spent / (double) p->plan->evaluations < o->seconds;
+}
+
+#define FEWEST_OF_SEARCH 8 /* evaluations: fewer lead nowhere */
+
+/* How many evaluations a search may take: under a budget a third of those that are left, since there are others. */
+static long affordable(const Planner *p, long most) {
+  const planner_options *o = p->options;
+  const double done = (double) p->plan->evaluations;
+  double left = (double) most * 3;
+  if (o->evaluations > 0) left = smaller(left, (double) o->evaluations - done);
+  if (o->seconds > 0 && done > 0) {
+    const double spent = o->clock(o->user) - p->began;
+    if (spent > 0) left = smaller(left, (o->seconds - spent) / spent * done);
+  }
+  return (long) larger(left / 3, FEWEST_OF_SEARCH < most ? FEWEST_OF_SEARCH : most);
 }
 
 /* Whether the order of searches matters, since there may not be time for all. */

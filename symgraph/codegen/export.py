@@ -11,7 +11,7 @@ from typing import Literal
 
 from symgraph.codegen.description import checked_name, describe
 from symgraph.codegen.foresight import foresight
-from symgraph.codegen.header import FUNCTIONS, header
+from symgraph.codegen.header import header
 from symgraph.codegen.items import functions_in
 from symgraph.codegen.pages import build_file, main_program, manual
 from symgraph.codegen.programs import programs_of
@@ -102,7 +102,7 @@ def export_c(
         stack = stack_of(source.text)
         description = description.with_sizes(source.task, len(numbers), source.memory, stack)
         public, inside = _named(header(description), name), _named(source.text, name)
-        _check_clash(name, public, inside)
+        _check_clash(name, public, source.text)
         files: dict[str, str | bytes] = {
             f"{name}.h": public,
             f"{name}.c": inside,
@@ -162,12 +162,19 @@ def _notes(objective: Objective) -> list[str]:
 
 
 def _check_clash(name: str, public: str, source: str) -> None:
-    """Refuse a name with which public names would be those of something inside the C file."""
+    """Refuse a name with which public names would be those of something inside the C file.
+
+    Args:
+        name: of the planner.
+        public: its header.
+        source: its C file, still with `planner_` in the place of the name.
+    """
     inside = set(functions_in(source)) | set(re.findall(r"^#define (\w+)", source, re.MULTILINE))
     inside |= set(re.findall(r"^static const \w+ (\w+)", source, re.MULTILINE))
+    own = {word for word in inside if word.lower().startswith("planner_")}
     declared = set(re.findall(rf"\b(?:{name}|{name.upper()})_\w+", public))
-    own = {f"{name}_{function}" for function in FUNCTIONS} | {f"{name.upper()}_BEGIN_ARGUMENTS"}
-    clash = sorted((inside & declared) - own)
+    declared |= {f"{name}_{word[len('planner_') :]}" for word in own if word.startswith("planner_")}
+    clash = sorted((inside - own) & declared)
     if clash:
         raise InputError(
             f"export_c: name = {name!r} makes {clash[0]!r}, which stands for something else; give another name"

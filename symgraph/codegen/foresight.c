@@ -48,8 +48,9 @@ static void look_ahead(Planner *p, const double *x, const int *choices) {
 #endif
 
 /* Leave the best search that has ended in the plan. Where a model jumps, a search may end on an edge where its own arithmetic
-   alone stays: its value is then that which follows from the outcomes of the nodes, and perhaps another search is better. */
-static void settle(Planner *p) {
+   alone stays: its value is then that which follows from the outcomes of the nodes, and perhaps another search is better.
+   Returns 0 if there is none. */
+static int settle(Planner *p) {
   struct room *const room = &p->room;
   for (;;) {
     struct ended *best = 0;
@@ -59,9 +60,10 @@ static void settle(Planner *p) {
       struct ended *one = room->done + i;
       if (isfinite(one->value) && (!best || is_better(one->value, one->missed, best->value, best->missed))) best = one;
     }
-    if (!best || !may_go_on(p)) return;
+    if (!best) return 0;
+    if (!may_go_on(p)) return 1;
     if (!best->told) {
-      if (!has_time_for(p, FORESIGHT)) return;
+      if (!has_time_for(p, FORESIGHT)) return 1;
       look_ahead(p, best->x, best->choices);
       worth = p->foresight.values[0] - (RISK != 0 ? RISK * sqrt(larger(p->foresight.spreads[0], 0)) : 0);
       rounding = TOLD * fabs(best->value) + TOLD_SCALE * best->scale;
@@ -72,6 +74,6 @@ static void settle(Planner *p) {
       }
     }
     keep(p->plan, best->x, best->choices, best->value, best->missed, best->violation, best->worst);
-    return;
+    return 1;
   }
 }

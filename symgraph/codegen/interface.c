@@ -56,7 +56,7 @@ int planner_begin(PLANNER_BEGIN_ARGUMENTS) {
   const real *numbers = 0;
   if (!memory || !planner) return PLANNER_NULL;
   *planner = 0;
-  if (bytes < sizeof(Planner)) return PLANNER_MEMORY_TOO_SMALL;
+  if (bytes < PLANNER_MEMORY) return PLANNER_MEMORY_TOO_SMALL;
   if ((size_t) memory % alignment) return PLANNER_MISALIGNED;
 #if WEIGHTS_FILE
   {
@@ -78,7 +78,7 @@ static int take_state(Planner *p, const planner_state *state) {
   double numbers[N_STATE + 1] = {0};
   int i;
 #if UNCERTAIN
-  int c, j, size, begin;
+  int c, j, size;
 #endif
   if (!p || !state) return PLANNER_NULL;
   if (p->mark != BEGUN) return PLANNER_NOT_BEGUN;
@@ -89,15 +89,17 @@ static int take_state(Planner *p, const planner_state *state) {
     if (!isfinite(p->state[i])) return PLANNER_STATE_NOT_FINITE;
   }
 #if UNCERTAIN
-  for (c = 0; c < N_COVARIANCES; ++c) {
+  for (c = 0; c < N_COVARIANCES; ++c) { /* each pair of elements is looked at */
+    const double *const matrix = numbers + covariances[c][0];
+    double rounding = 0;
     size = covariances[c][1];
-    begin = covariances[c][0];
+    for (i = 0; i < size * size; ++i) rounding = larger(rounding, 1e-9 * fabs(matrix[i]));
     for (i = 0; i < size; ++i) {
-      if (numbers[begin + i * (size + 1)] < 0) return PLANNER_COVARIANCE;
+      if (matrix[i * (size + 1)] < -rounding) return PLANNER_COVARIANCE;
       for (j = 0; j < i; ++j) {
-        const double a = numbers[begin + i + j * size], b = numbers[begin + j + i * size];
-        const double bound = numbers[begin + i * (size + 1)] * numbers[begin + j * (size + 1)];
-        if (fabs(a - b) > 1e-9 * (fabs(a) + fabs(b)) || a * a > bound * (1 + 1e-6)) return PLANNER_COVARIANCE;
+        const double a = matrix[i + j * size], b = matrix[j + i * size];
+        const double bound = larger(matrix[i * (size + 1)], 0) * larger(matrix[j * (size + 1)], 0);
+        if (fabs(a - b) > rounding || fabs(a) > sqrt(bound) * (1 + 1e-6) + rounding) return PLANNER_COVARIANCE;
       }
     }
   }
@@ -156,7 +158,6 @@ static void search(Planner *p) {
 
 int planner_solve(planner_planner *p, const planner_state *state, const planner_options *options, planner_plan *plan) {
   planner_options none;
-  struct room *room;
   double began;
   int wrong, i, s;
   if (!p || !plan) return PLANNER_NULL;
@@ -169,7 +170,6 @@ int planner_solve(planner_planner *p, const planner_state *state, const planner_
   if (wrong) return wrong;
   memset(plan, 0, sizeof *plan);
   memset(&p->room, 0, sizeof p->room);
-  room = &p->room;
   p->options = options;
   p->plan = plan;
   p->over = 0;
@@ -194,11 +194,9 @@ int planner_solve(planner_planner *p, const planner_state *state, const planner_
   p->settings.oscillation = OSCILLATIONS;
   p->settings.scaled = SCALED_STEPS;
   p->settings.keep_best = KEEP_BEST;
-  seed_draws(&p->draws, 0);
-  spread_points(&p->draws, SCALE_SAMPLES, p->low, p->high, room->typical, room->scratch, room->keys, room->order);
   seed_draws(&p->draws, options->seed);
   search(p);
-  settle(p);
+  if (!settle(p) && !p->over) plan->found = 0; /* samples alone had finite values */
   p->options = 0;
   if (options->clock) plan->seconds = options->clock(options->user) - p->began;
   return plan->found ? p->over : PLANNER_NO_PLAN;
@@ -278,18 +276,18 @@ static int last_write(int node, int label) {
 }
 
 const double *planner_mean(const planner_outcomes *outcomes, int node, int label) {
-  const int i = last_write(node, label);
+  const int i = outcomes ? last_write(node, label) : -1;
   return i < 0 ? 0 : outcomes->moments + writes[i][1];
 }
 
 const double *planner_covariance(const planner_outcomes *outcomes, int node, int label) {
-  const int i = last_write(node, label);
+  const int i = outcomes ? last_write(node, label) : -1;
   return i < 0 || writes[i][2] < 0 ? 0 : outcomes->moments + writes[i][2];
 }
 
 const char *planner_message(int status) {
   switch (status) {
-    case PLANNER_OK: return "the search came to its end";
+    case PLANNER_OK: return "ok";
     case PLANNER_TIME_LIMIT: return "time is over: the best plan so far";
     case PLANNER_EVALUATION_LIMIT: return "the evaluations are spent: the best plan so far";
     case PLANNER_INTERRUPTED: return "the caller ended the search: the best plan so far";
@@ -301,7 +299,7 @@ const char *planner_message(int status) {
     case PLANNER_BUSY: return "this planner is searching: take another one, or wait";
     case PLANNER_STATE_NOT_FINITE: return "a number of the state is not finite";
     case PLANNER_COVARIANCE: return "a covariance of the state is not symmetric, or no covariance";
-    case PLANNER_ACTION: return "an action is not finite, or out of its bounds";
+    case PLANNER_ACTION: return "an action is not finite or, as a start or held, out of its bounds";
     case PLANNER_CHOICE: return "a selection has no such choice";
     case PLANNER_OPTION: return "an option is negative, too large, or time is limited without a clock";
     case PLANNER_WEIGHTS_LENGTH: return "the weights are cut short, or too long";

@@ -73,7 +73,7 @@ static int climb_all(Planner *p) {
     struct ended made;
     room->starts[i].used = 0;
     ++p->plan->starts;
-    if (!climb_from(p, room->starts[i].x, room->starts[i].choices, TOLERANCE, ITERATIONS, &made)) return 0;
+    if (!climb_from(p, room->starts[i].x, room->starts[i].choices, TOLERANCE, affordable(p, ITERATIONS), &made)) return 0;
 #if IMPROVES
     if (isfinite(made.value) && made.missed >= 0 && room->ended_count < MOST_GUESSES + MOST_STARTS)
       room->ended[room->ended_count++] = made;
@@ -88,14 +88,16 @@ static void optimize(Planner *p) {
   for (i = 0; i < MOST_GUESSES + MOST_STARTS; ++i) room->starts[i].used = 0;
   room->ended_count = 0;
   begin_round(p);
-  if (is_limited(p)) { /* what the caller suggests comes first; and as long as samples had to be few, there are more rounds */
+  if (is_limited(p)) { /* what the caller suggests comes first, then rounds of few samples and the climbs from them */
+    int suggested;
     add_guesses(p);
     if (!climb_all(p)) return;
+    suggested = p->plan->starts;
     do {
       begin_round(p);
       find_promising(p, STARTS, SAMPLES);
       if (!climb_all(p)) return;
-    } while (p->cut_short && !ENUMERATES);
+    } while (!ENUMERATES && (p->cut_short || p->plan->starts - suggested < STARTS));
   } else {
     find_promising(p, STARTS, SAMPLES);
     add_guesses(p);

@@ -26,9 +26,9 @@ struct room {
   int order[MOST_SAMPLES], ranks[MOST_SAMPLES], picked[MOST_SAMPLES], fitting[MOST_SAMPLES];
   /* combinations of choices: those that are sampled, and what is known of some */
   int rows[ROWS * N_SELECTIONS + 1], numbers[ROWS];
-  double typical[SCALE_SAMPLES * N_ACTIONS + 1], column[SCALE_SAMPLES], margins[SCALE_SAMPLES * N_MARGINS + 1];
+  double typical[SCALE_SAMPLES * N_ACTIONS + 1], typical_scratch[SCALE_SAMPLES * N_ACTIONS + 1], column[SCALE_SAMPLES], margins[SCALE_SAMPLES * N_MARGINS + 1];
   struct known known[KNOWN];
-  int next_known;
+  int next_known, has_typical, typical_order[SCALE_SAMPLES];
   /* points that wait, those that are suggested first; searches that have ended */
   struct start starts[MOST_GUESSES + MOST_STARTS];
   struct ended ended[MOST_GUESSES + MOST_STARTS], polish[MOST_POLISHED];

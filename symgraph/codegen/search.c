@@ -47,11 +47,8 @@ static int end_search(Planner *p, struct ended *made, const struct known *here) 
   const planner_options *o = p->options;
   planner_plan *plan = p->plan;
 #if REQUIREMENTS
-  if (isfinite(made->value)) {
-    made->missed = judged_breach(p, made->x, made->choices, here->units, &made->value, &made->violation,
-                                 &made->worst);
-    if (p->over) return 0;
-  }
+  made->missed = judged_breach(p, made->x, made->choices, here->units, &made->value, &made->violation, &made->worst);
+  if (p->over) return 0;
 #else
   (void) here;
   made->missed = made->violation = 0;

@@ -6,9 +6,13 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
+
 from symgraph.errors import InputError
 from symgraph.optimizers import Adadelta, Enumerate, Lbfgs, Optimizer
+from symgraph.optimizers.enumerate import MOST_COMBINATIONS as MOST_COMBINATIONS_ENUMERATED
 
+MOST = 2**31 - 1  # of what a setting counts
 MOST_GUESSES = 16  # start points from the caller
 MOST_SAMPLES_OF_ONE = 1024  # of one combination of selections, as in optimizers/starts.py
 MOST_TRIED = 1024  # combinations of selections that a search keeps in mind
@@ -54,6 +58,11 @@ def settings_of(optimizer: Optimizer, n_actions: int, choices: tuple[int, ...], 
     enumerates = isinstance(optimizer, Enumerate)
     inner = optimizer.optimizer if isinstance(optimizer, Enumerate) else optimizer
     combinations = math.prod(choices)
+    if enumerates and combinations > MOST_COMBINATIONS_ENUMERATED:
+        raise InputError(
+            f"export_c: the selections have {combinations:,} combinations, more than Enumerate takes "
+            f"({MOST_COMBINATIONS_ENUMERATED:,}); give Lbfgs(), which tries the most promising"
+        )
     if isinstance(inner, Lbfgs):
         file, macros, flags = _lbfgs(inner)
     elif isinstance(inner, Adadelta):
@@ -82,7 +91,17 @@ def settings_of(optimizer: Optimizer, n_actions: int, choices: tuple[int, ...], 
         "SAMPLING": SAMPLING,
     }
     name = f"Enumerate({type(inner).__name__})" if enumerates else type(inner).__name__
-    return Settings(file, macros, flags, name, asdict(inner))
+    given = {key: _plain(value) for key, value in asdict(inner).items()}
+    return Settings(file, {key: _plain(value) for key, value in macros.items()}, flags, name, given)
+
+
+def _plain(value: Any) -> Any:
+    """Return a number as C and JSON have it: none of NumPy's, and no longer than a long is anywhere."""
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return min(int(value), MOST)
+    return float(value) if isinstance(value, (float, np.floating)) else value
 
 
 def _lbfgs(one: Lbfgs) -> tuple[str, dict[str, int | float], dict[str, bool]]:

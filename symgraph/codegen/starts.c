@@ -2,6 +2,8 @@
    problem.py do the same. */
 
 #define FEWEST_SAMPLES 16
+#define MOST_SAMPLES_OF_ROUND 32 /* of one combination of choices, under a budget */
+#define MOST_GROUPS_OF_ROUND 64
 #define MOST_EVEN 1000000000.0 /* combinations, beyond which each selection is drawn on its own */
 
 static long more(long a, long b) { return a > b ? a : b; }
@@ -47,6 +49,13 @@ static struct known *knowledge_of(Planner *p, const int *choices) {
   struct known *const here = entry(p, choices);
   int count = SCALE_SAMPLES, i, k;
   if (here->scale > 0) return here;
+  if (!room->has_typical) { /* drawn when they are needed: that takes time */
+    struct draws fixed;
+    seed_draws(&fixed, 0);
+    spread_points(p, &fixed, SCALE_SAMPLES, p->low, p->high, room->typical, room->typical_scratch, room->column,
+                  room->typical_order);
+    room->has_typical = 1;
+  }
 #if !REQUIREMENTS
   if (is_limited(p)) count /= 4; /* a rough scale will do */
 #endif
@@ -108,6 +117,7 @@ static void find_peaks(Planner *p, int samples, int count) {
   if (half <= count) return;
   for (a = 0; a < half; ++a) {
     double nearest = INFINITY;
+    if (is_late(p)) return; /* the best ones */
     for (b = 0; b < a; ++b) {
       const double *x = room->points + room->order[a] * N_ACTIONS, *y = room->points + room->order[b] * N_ACTIONS;
       double square = 0;
@@ -141,7 +151,7 @@ static void sample(Planner *p, const int *choices, int count, int each, int grou
 #endif
   int looked = 0, r, i, e;
   double scale;
-  spread_points(&p->draws, count, p->low, p->high, room->points, room->scratch, room->keys, room->order);
+  spread_points(p, &p->draws, count, p->low, p->high, room->points, room->scratch, room->keys, room->order);
   for (; looked < count && may_go_on(p); ++looked) {
     if (looked > 0 && has_spent(p, share)) {
       p->cut_short = 1;
@@ -158,7 +168,7 @@ static void sample(Planner *p, const int *choices, int count, int each, int grou
 #endif
   }
   if (looked == 0) return;
-  scale = scale_from(room->values, looked, FEWEST_SAMPLES);
+  scale = scale_from(room->values, looked, is_limited(p) ? FEWEST_SAMPLES / 4 : FEWEST_SAMPLES);
   if (scale > 0) entry(p, choices)->scale = scale;
 #if REQUIREMENTS
   for (r = 0; r < looked; ++r) {
@@ -190,12 +200,15 @@ static void sample(Planner *p, const int *choices, int count, int each, int grou
   }
 }
 
-/* Leave start points behind those that are suggested: the most promising of samples spread over the bounds. */
+/* Leave start points behind those that are suggested: the most promising of samples spread over the bounds. Under a budget
+   of few samples, so that the next look at the clock is never far. */
 static void find_promising(Planner *p, int starts, int samples) {
   const long all = combinations(p);
-  const int groups = (int) fewer(all, more(starts, MOST_SAMPLES_OF_ONE));
-  const int each = (int) more(1, starts / groups);
-  const int count = N_ACTIONS ? (int) more(each, fewer(each * samples, MOST_SAMPLES_OF_ONE)) : 1;
+  const int limited = is_limited(p);
+  const int groups = (int) fewer(all, more(starts, limited ? MOST_GROUPS_OF_ROUND : MOST_SAMPLES_OF_ONE));
+  const int wanted = (int) more(1, starts / groups), most = limited ? MOST_SAMPLES_OF_ROUND : MOST_SAMPLES_OF_ONE;
+  const int each = limited ? (int) fewer(wanted, more(1, most / samples)) : wanted;
+  const int count = N_ACTIONS ? (int) more(each, fewer((long) each * samples, most)) : 1;
   struct room *const room = &p->room;
   int g;
   p->cut_short = 0;
@@ -233,11 +246,11 @@ static void add_guesses(Planner *p) {
       open |= here->choices[s] < 0;
     }
     if (!open && is_limited(p) && may_go_on(p)) look(p, here->x, here->choices); /* no plan may be worse */
+    count_of_rows = (int) fewer(combinations(p), MOST_SAMPLES_OF_ONE);
+    draw_rows(p, count_of_rows, 1); /* for the same draws as in Python also where none is needed */
     if (!open) continue;
     best = *here;
     best.used = 0;
-    count_of_rows = (int) fewer(combinations(p), MOST_SAMPLES_OF_ONE);
-    draw_rows(p, count_of_rows, 1);
     for (r = 0; r < count_of_rows && (r == 0 || may_go_on(p)); ++r) {
       struct start one = *here;
       for (s = 0; s < N_SELECTIONS; ++s)
