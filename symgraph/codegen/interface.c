@@ -169,7 +169,7 @@ int planner_solve(planner_planner *p, const planner_state *state, const planner_
   wrong = take_state(p, state);
   if (wrong) return wrong;
   memset(plan, 0, sizeof *plan);
-  memset(&p->room, 0, sizeof p->room);
+  forget(&p->room);
   p->options = options;
   p->plan = plan;
   p->over = 0;

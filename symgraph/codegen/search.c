@@ -1,5 +1,13 @@
 /* A search from one start point, what becomes of it, and when all of them are over. */
 
+/* Forget what an earlier search kept; to clear all of it would take long. */
+static void forget(struct room *room) {
+  int i;
+  for (i = 0; i < KNOWN; ++i) room->known[i].filled = 0;
+  room->next_known = room->has_typical = room->ended_count = room->polish_count = 0;
+  room->done_count = room->tried_count = 0;
+}
+
 /* Note that a combination of choices was searched; returns 0 if there is no room to note more. */
 static int note_tried(struct room *room, const int *choices) {
   int t;
