@@ -270,7 +270,7 @@ def test_node_answers_what_the_planner_plans(package):
         assert stacked(made) == pytest.approx(stacked(plan.actions), abs=1e-6)
         assert {label: response[label] for label in plan.selections} == plan.selections
         assert response["status"] == package.constants["STATUS_OK"]
-        assert response["message"] == "the search came to its end"
+        assert response["message"] == "ok"
 
 
 def test_limits_and_seeds_are_the_requests_or_the_nodes(package):

@@ -152,8 +152,8 @@ static void optimize(Planner *p) {
 #if REQUEUE
     const int batch = 1;
 #else
-    const double affordable = ceil((total - (double) spent) / RUN_ITERATIONS);
-    const int batch = (int) smaller(fewer(wanted - finished, waiting), affordable);
+    const double runs_left = ceil((total - (double) spent) / RUN_ITERATIONS);
+    const int batch = (int) smaller(fewer(wanted - finished, waiting), runs_left);
 #endif
     const long limit = (long) smaller(RUN_ITERATIONS, larger(1, floor((total - (double) spent) / batch)));
     for (i = 0; i < batch; ++i) {
