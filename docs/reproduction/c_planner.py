@@ -196,7 +196,7 @@ def told(name, seconds, count):
     """What the host says of some states: gradient [s], value [s], value, spent [s], evaluations, gradients."""
     states = folder_of(name) / f"states{count}"
     states.write_text("\n".join(" ".join(numbers(name, state)) for state in situations(name, count)))
-    printed = run("taskset", "-c", str(max(os.sched_getaffinity(0))), host_of(name), seconds, states)
+    printed = run("taskset", "-c", str(min(os.sched_getaffinity(0))), host_of(name), seconds, states)
     return np.array([[float(word) for word in line.split()] for line in printed.splitlines()])
 
 
