@@ -2,8 +2,6 @@
 
 import json
 import re
-import signal
-import threading
 
 import casadi as ca
 import numpy as np
@@ -12,6 +10,7 @@ from exported_hosts import COMPILERS, run
 from exported_tasks import stacked, task
 from hypothesis import given
 from hypothesis import strategies as st
+from wrapped_kernels import ctrl_c_after
 
 import symgraph as sg
 from symgraph.codegen.description import Description, c_names
@@ -267,8 +266,8 @@ def test_ctrl_c_ends_a_search(tmp_path):
     graph.reward("a", lambda x: -ca.sumsqr(ca.sin(7 * x) * x) - 0.1 * ca.sumsqr(x[1:] - x[:-1] ** 2))
     objective = sg.Objective(sg.unroll(graph))
     planner = sg.CPlanner(sg.export_c(objective, tmp_path, name="lasting", optimizer=sg.Lbfgs(starts=20_000)))
-    threading.Timer(0.5, signal.raise_signal, [signal.SIGINT]).start()
-    plan = planner.solve({})
+    with ctrl_c_after(0.5):
+        plan = planner.solve({})
     assert plan.status.startswith("interrupted: best of ")
     assert np.isfinite(plan.value)
 

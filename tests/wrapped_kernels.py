@@ -1,5 +1,6 @@
 """Kernels that are interrupted on purpose."""
 
+import gc
 import signal
 import threading
 from contextlib import contextmanager
@@ -47,13 +48,19 @@ class InterruptedLater(Interrupting):
 
 @contextmanager
 def ctrl_c_after(seconds):
-    """The signal that Ctrl-C sends, as the terminal sends it: to the main thread, wherever that is."""
+    """The signal that Ctrl-C sends, as the terminal sends it: to the main thread, wherever that is.
+
+    Were that in one of the callbacks that Hypothesis lets the garbage collector call, Python would note the exception
+    and drop it.
+    """
     timer = threading.Timer(seconds, signal.pthread_kill, [threading.main_thread().ident, signal.SIGINT])
+    callbacks, gc.callbacks[:] = gc.callbacks[:], []
     timer.start()
     try:
         yield
     finally:
         timer.cancel()
+        gc.callbacks[:] = callbacks
 
 
 def wrap_kernels(monkeypatch, kind, wrap):
