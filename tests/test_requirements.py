@@ -255,6 +255,16 @@ def test_a_plan_put_back_through_fixed_is_judged_alike():
     assert "missed" not in sg.solve(objective, {}, fixed=moved).status
 
 
+@pytest.mark.parametrize("optimizer", [sg.Lbfgs(), sg.Ipopt(), sg.Enumerate()], ids=lambda o: type(o).__name__)
+def test_breaches_whose_squares_are_no_numbers_any_more(optimizer):
+    graph = sg.Graph({"x": sg.State(), "u": sg.Action(low=0.5, high=1.0)}, "a")
+    graph.require("a", lambda x, u: u / x, high=1.0)
+    graph.reward("a", lambda u: u)
+    plan = sg.solve(objective_of(graph), {"x": 2e-238}, optimizer)
+    assert plan.violation > 1e237
+    assert "missed" in plan.status or "breach" in plan.status or plan.notes
+
+
 def test_requirements_without_a_name_are_told_by_what_they_read():
     graph = sg.Graph({"u": sg.Action(low=0, high=1)}, start="go")
     graph.require("go", lambda u: u, low=2)

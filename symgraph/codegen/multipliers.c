@@ -89,7 +89,7 @@ static void first_weights(Planner *p, double scale, const double *units) {
   int k;
   for (k = 0; k < N_MARGINS; ++k) {
     p->room.multipliers[k] = 0;
-    p->room.weights[k] = isinf(units[k]) ? 0 : FIRST_WEIGHT * scale / (units[k] * units[k]);
+    p->room.weights[k] = isinf(units[k]) ? 0 : FIRST_WEIGHT * scale / units[k] / units[k];
   }
 }
 

@@ -68,7 +68,7 @@ static double penalty_of(const double *margins, const double *units, double scal
   for (k = 0; k < N_MARGINS; ++k)
     if (!isinf(units[k])) {
       const double breach = violation_of(k, margins[k]);
-      sum += FIRST_WEIGHT * scale / (units[k] * units[k]) / 2 * breach * breach;
+      sum += FIRST_WEIGHT * scale / units[k] / units[k] / 2 * breach * breach;
     }
   return sum;
 }

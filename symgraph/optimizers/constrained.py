@@ -126,7 +126,7 @@ class Constrained:
     def penalty(self, margins: Array, choice: Choices, scale: float) -> Array:
         """Return what `penalised` takes away (…,) at margins (…, k)."""
         weights = self._weights(choice, scale)
-        with np.errstate(invalid="ignore"):
+        with np.errstate(invalid="ignore", over="ignore"):  # infinite margins, and those whose squares are
             terms = np.where(weights > 0.0, weights / 2 * violations(margins, self._constraints) ** 2, 0.0)
         return np.asarray(terms.sum(axis=-1))
 
@@ -189,4 +189,5 @@ class Constrained:
             before, slack = wrong, slack / 10.0
 
     def _weights(self, choice: Choices, scale: float) -> Array:
-        return FIRST_WEIGHT * scale / self.units(choice) ** 2
+        units = self.units(choice)
+        return FIRST_WEIGHT * scale / units / units  # the square of a unit may be no number
