@@ -195,6 +195,9 @@ def bind(model: Any, slots: Mapping[str, Slot], role: str, place: str, branches:
             model = Model(model)
         except GraphError as error:
             raise GraphError(f"{place}: {error}") from None
+    if is_propagator(model.function) and getattr(model.function, "propagation", "") is None:
+        model = copy.copy(model)
+        model.function = model.function.with_propagation(DEFAULT_PROPAGATION[role])
     place = f"{place}: model {model.name!r}"
     own_names = _reads(model.function, place)
     reads = {}
@@ -260,7 +263,9 @@ def _written_sizes(
     if is_propagator(function):
         x = {label: ca.MX.sym(label, slots[label].size) for label in reads.values()}
         sigma = {label: ca.MX.sym(label, s.size, s.size) for label, s in slots.items() if isinstance(s, State)}
-        sigma = {label: sigma[label] for label in x if label in sigma}
+        # The rules of plain functions need no check, and take time.
+        known = getattr(function, "propagation", None) in RULES
+        sigma = {label: sigma[label] for label in x if label in sigma and not known}
         moments = _call_propagator(function, reads, x, sigma, place)
         if not all(isinstance(parameter, Parameter) for parameter in _parameters(function)):
             raise GraphError(

@@ -21,8 +21,9 @@ class Propagator(Protocol):
     (n, 1) columns and covariances as (n, n) matrices. A reward model writes one scalar under any name, a probability
     model one scalar per branch. Weights that change without a rebuild are listed as `parameters`, a sequence of
     `Parameter`, and enter `propagate` by their symbols. Three more attributes are used where there are any: `name`, in
-    messages; `with_propagation(rule)`, for `Model(…, propagation=rule)`; and `lacking`, a text that says what it
-    still needs before it can be planned with, such as "2 of 3 samples", or None.
+    messages; `with_propagation(rule)`, for `Model(…, propagation=rule)`, which is called with the default of plain
+    functions if there is an attribute `propagation` that is None; and `lacking`, a text that says what it still needs
+    before it can be planned with, such as "2 of 3 samples", or None.
     """
 
     reads: Iterable[str]

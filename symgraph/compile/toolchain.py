@@ -69,7 +69,7 @@ def load(key: str, source: Callable[[], list[str]], compiler: str, flags: tuple[
         CompileError: the compiler, the disk or the loader refused.
     """
     try:
-        folder = _private_folder()
+        folder = private_folder("kernels")
         flags = FLAGS if flags is None else flags
         joined = "\0".join([key, *_identity(compiler), *flags, *vector_library()[0]])
         key = hashlib.sha256(joined.encode()).hexdigest()[:32]
@@ -121,9 +121,9 @@ def _name(key: str, path: Path) -> str:
     return f"{key}-{hashlib.sha256(path.read_bytes()).hexdigest()[:16]}.so"
 
 
-def _private_folder() -> Path:
-    """Return the cache folder if nobody else can write to it, else a new one for this process."""
-    folder = Path(platformdirs.user_cache_dir("symgraph")) / "kernels"
+def private_folder(name: str) -> Path:
+    """Return a folder of the user's cache if nobody else can write to it, else a new one for this process."""
+    folder = Path(platformdirs.user_cache_dir("symgraph")) / name
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         info = folder.stat()

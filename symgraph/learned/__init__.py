@@ -7,6 +7,7 @@ from symgraph.learned.loop import OnlineLoop
 from symgraph.learned.network import FitReport, StochasticNetwork
 from symgraph.learned.report import EpisodeReport
 from symgraph.learned.schedule import Exploration, Stage, World
+from symgraph.learned.torch_modules.model import TorchModel, from_torch
 
 __all__ = [
     "BranchNetwork",
@@ -22,7 +23,9 @@ __all__ = [
     "Scores",
     "Stage",
     "StochasticNetwork",
+    "TorchModel",
     "Visit",
     "World",
     "calibrate",
+    "from_torch",
 ]

@@ -1,0 +1,156 @@
+"""Symbolic tensors: numbers in torch's order as a CasADi column, and the operations that only move them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+import torch
+
+Shape = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Symbol:
+    """A tensor whose numbers follow from the inputs, or from weights that may change.
+
+    Attributes:
+        column: (n, 1), the numbers with the last index running fastest. Reshaped by CasADi, in whose matrices the first
+            index does, a tensor (r, c) is the matrix (c, r): its transpose, without a number being moved.
+        shape: of the tensor.
+        fixed: whether it follows from weights alone.
+    """
+
+    column: ca.MX
+    shape: Shape
+    fixed: bool = False
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape)
+
+    def matrix(self, rows: int) -> ca.MX:
+        """Return the numbers as a matrix (rows, n / rows)."""
+        return ca.reshape(self.column, rows, self.size // rows if rows else 0)
+
+    def reshaped(self, shape: Sequence[int]) -> Symbol:
+        return Symbol(self.column, tuple(shape), self.fixed)
+
+    def gathered(self, where: npt.NDArray[np.int64]) -> Symbol:
+        """Return numbers of this tensor; -1 stands for zero."""
+        return gather([self], where)
+
+    def expanded(self, shape: Shape) -> Symbol:
+        """Return it repeated along dimensions of size 1, as far as arithmetic does not do that by itself."""
+        if self.shape == shape:
+            return self
+        return self.gathered(np.broadcast_to(indices(self.shape), shape))
+
+    def ordered(self, dims: Sequence[int]) -> tuple[ca.MX, Shape]:
+        """Return a matrix with the given dimensions along its columns, and the shape of the others."""
+        rest = [d for d in range(len(self.shape)) if d not in dims]
+        moved = self.gathered(indices(self.shape).transpose([*rest, *dims]))
+        return moved.matrix(math.prod(self.shape[d] for d in dims)), tuple(self.shape[d] for d in rest)
+
+
+def indices(shape: Shape) -> npt.NDArray[np.int64]:
+    """Return an array of that shape that counts its elements."""
+    return np.arange(math.prod(shape)).reshape(shape)
+
+
+def constant(value: Any, shape: Shape | None = None) -> Symbol:
+    """Return a tensor of numbers."""
+    numbers = np.asarray(value.detach() if isinstance(value, torch.Tensor) else value, dtype=float)
+    return Symbol(ca.MX(ca.DM(numbers.ravel())), numbers.shape if shape is None else shape, fixed=True)
+
+
+def gather(sources: Sequence[Symbol], where: npt.NDArray[np.int64]) -> Symbol:
+    """Return numbers of tensors that are thought of as one column; -1 stands for zero."""
+    where = np.asarray(where)
+    flat, fixed = where.ravel(), all(source.fixed for source in sources)
+    if not flat.size:
+        return Symbol(ca.MX(0, 1), where.shape, fixed)
+    total = sum(source.size for source in sources)
+    if flat.size == total and (flat == np.arange(total)).all():
+        return Symbol(ca.vertcat(*[source.column for source in sources]), where.shape, fixed)
+    columns = [source.column for source in sources]
+    if (flat < 0).any():
+        columns.append(ca.MX(ca.DM.zeros(1, 1)))
+        flat = np.where(flat < 0, total, flat)
+    column = ca.vertcat(*columns)
+    # Of a single number CasADi makes a row.
+    return Symbol(ca.vec(column[flat.tolist()]), where.shape, fixed)
+
+
+def moved(operator: Callable[..., Any], args: Any, kwargs: dict[str, Any]) -> Any:
+    """Return what an operator makes that only moves, repeats or drops numbers, or fills up with zeros.
+
+    Where the numbers end up torch says itself: it is given their places instead of them.
+    """
+    sources: list[Symbol] = []
+
+    def placed(value: Any) -> Any:
+        if not isinstance(value, Symbol):
+            return value
+        begin = 1 + sum(source.size for source in sources)
+        sources.append(value)
+        return torch.arange(begin, begin + value.size, dtype=torch.float64).reshape(value.shape)
+
+    made = operator(*mapped(placed, args), **mapped(placed, kwargs))
+    return mapped(lambda place: gather(sources, place.numpy().astype(np.int64) - 1), made)
+
+
+def linear(operator: Callable[..., Any], args: Any, kwargs: dict[str, Any]) -> Symbol:
+    """Return what an operator makes that is linear in all its symbolic tensors together, as a sparse matrix."""
+    sources: list[Symbol] = []
+    mapped(lambda value: sources.append(value) if isinstance(value, Symbol) else None, (args, kwargs))
+    total = sum(source.size for source in sources)
+
+    def result(unit: int) -> torch.Tensor:
+        left = iter(np.cumsum([0, *(source.size for source in sources)]).tolist())
+
+        def part(value: Any) -> Any:
+            if not isinstance(value, Symbol):
+                return value
+            numbers, begin = torch.zeros(value.size, dtype=torch.float64), next(left)
+            if begin <= unit < begin + value.size:
+                numbers[unit - begin] = 1.0
+            return numbers.reshape(value.shape)
+
+        return operator(*mapped(part, args), **mapped(part, kwargs))  # type: ignore[no-any-return]  # an aten operator
+
+    rows: list[int] = []
+    columns: list[int] = []
+    numbers: list[float] = []
+    for unit in range(total):
+        made = result(unit)
+        flat = made.flatten().numpy()
+        (places,) = np.nonzero(flat)
+        rows += places.tolist()
+        columns += [unit] * len(places)
+        numbers += flat[places].tolist()
+    shape = tuple(made.shape)
+    matrix = ca.DM.triplet(rows, columns, ca.DM(numbers), math.prod(shape), total)
+    column = ca.mtimes(ca.MX(matrix), ca.vertcat(*[source.column for source in sources]))
+    return Symbol(ca.densify(column), shape, all(source.fixed for source in sources))
+
+
+def mapped(function: Callable[[Any], Any], tree: Any) -> Any:
+    """Return nested lists, tuples and dicts with every leaf replaced."""
+    if isinstance(tree, (list, tuple)):
+        return [mapped(function, branch) for branch in tree]
+    if isinstance(tree, dict):
+        return {key: mapped(function, branch) for key, branch in tree.items()}
+    return function(tree)
+
+
+def leaves(tree: Any) -> list[Any]:
+    """Return all leaves of nested lists, tuples and dicts."""
+    found: list[Any] = []
+    mapped(found.append, tree)
+    return found
