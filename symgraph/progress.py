@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from types import TracebackType
@@ -21,6 +22,7 @@ class Progress:
     def __init__(self, task: str, shown: bool = True) -> None:
         self._task = task
         self._shown = shown
+        self._stream = sys.stderr  # of now: what is done may silence it
         self._bar: Any = None
         self._row: Any = None
         self._lock = threading.Lock()
@@ -72,7 +74,7 @@ class Progress:
             from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
             from rich.progress import Progress as Bar
 
-            console = Console(stderr=True)
+            console = Console(file=self._stream)
             if not (console.is_terminal or console.is_jupyter):
                 self._shown = False
                 return

@@ -1,6 +1,7 @@
 """The progress bar: there when it takes long and somebody looks."""
 
 import io
+import sys
 import threading
 import time
 
@@ -21,8 +22,8 @@ class Terminal(io.StringIO):
 def show_on(screen, monkeypatch):
     """Let rich write here instead of to stderr, which pytest replaces between a fixture and its test."""
 
-    def console(*, stderr):
-        assert stderr  # never among a program's output
+    def console(*, file):
+        assert file is sys.stderr  # never among a program's output
         return CONSOLE(file=screen)
 
     monkeypatch.setattr(rich.console, "Console", console)

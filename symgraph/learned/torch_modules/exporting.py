@@ -8,7 +8,7 @@ import logging
 import threading
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stderr
 from typing import Any
 
 import casadi as ca
@@ -74,7 +74,7 @@ def exported(twin: torch.nn.Module, shapes: Sequence[tuple[int, ...]], name: str
         InputError: torch cannot export it, or it changes its own buffers.
     """
     # Where torch refuses, it prints and logs at length.
-    with double_by_default(), warnings.catch_warnings(), redirect_stdout(io.StringIO()):
+    with double_by_default(), warnings.catch_warnings(), redirect_stderr(io.StringIO()):
         warnings.simplefilter("ignore")
         inputs = tuple(torch.zeros(shape) for shape in shapes)
         try:
