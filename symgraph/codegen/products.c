@@ -3,11 +3,18 @@
 
 #define SUMS 8 /* of one column, side by side, since the order of one sum must not be changed */
 #define PLAIN(w) (w)
+
+/* gcc 12 makes wrong code of small products where it writes them out in their caller with vectors of 64 bytes. */
+#if defined(__GNUC__) && !defined(__clang__)
+#define APART __attribute__((noinline, noclone))
+#else
+#define APART
+#endif
 #define SQUARE(w) ((w) * (w))
 
 /* z (m, n) = NUMBER(w (m, k)) x (k, n): four columns of w at once, for two columns of x. */
 #define MULTIPLY(name, NUMBER) \
-  static void name(const real *w, const real *x, real *z, int m, int k, int n) { \
+  static APART void name(const real *w, const real *x, real *z, int m, int k, int n) { \
     int i, j, p; \
     for (i = 0; i < m * n; ++i) z[i] = 0; \
     for (j = 0; j + 2 <= n; j += 2, x += 2 * k, z += 2 * m) { \
@@ -48,7 +55,7 @@ MULTIPLY(multiply_squares, SQUARE)
 
 /* z (m, n) = NUMBER(w (k, m))^T x (k, n). */
 #define MULTIPLY_TRANSPOSED(name, NUMBER) \
-  static void name(const real *w, const real *x, real *z, int m, int k, int n) { \
+  static APART void name(const real *w, const real *x, real *z, int m, int k, int n) { \
     int i, j, p, s; \
     for (j = 0; j < n; ++j, x += k, z += m) { \
       const real *a = w; \

@@ -47,6 +47,8 @@ _exporting = threading.Lock()
 
 def in_double(module: torch.nn.Module, name: str) -> torch.nn.Module:
     """Return a copy in double precision, on the CPU, in eval mode."""
+    if isinstance(module, torch.jit.ScriptModule):
+        raise InputError(f"from_torch({name}): the module is a TorchScript module: give the module that was scripted")
     for path, part in module.named_modules():
         if any(map(torch.nn.parameter.is_lazy, (*part._parameters.values(), *part._buffers.values()))):
             raise InputError(
@@ -74,8 +76,7 @@ def exported(twin: torch.nn.Module, shapes: Sequence[tuple[int, ...]], name: str
         InputError: torch cannot export it, or it changes its own buffers.
     """
     # Where torch refuses, it prints and logs at length.
-    with double_by_default(), warnings.catch_warnings(), redirect_stderr(io.StringIO()):
-        warnings.simplefilter("ignore")
+    with double_by_default(), redirect_stderr(io.StringIO()):
         inputs = tuple(torch.zeros(shape) for shape in shapes)
         try:
             program = torch.export.export(twin, inputs, strict=False)
@@ -121,6 +122,12 @@ def lowered_module(module: torch.nn.Module, shapes: Sequence[tuple[int, ...]], n
     Raises:
         InputError: torch cannot export it, an operator has no CasADi form, or the function does not compute the same.
     """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # they come again where the module is used
+        return _lowered_module(module, shapes, name)
+
+
+def _lowered_module(module: torch.nn.Module, shapes: Sequence[tuple[int, ...]], name: str) -> Lowered:
     twin = in_double(module, name)
     key = cache.fingerprint(twin, shapes)
     found = cache.find(key)

@@ -244,7 +244,7 @@ class Lowering:
         if target is torch.ops.higher_order.with_effects:
             token, inner, *others = args
             return [token, self.call(inner, *others, **kwargs)]
-        if torch.Tag.nondeterministic_seeded in getattr(target, "tags", ()) and target not in ELEMENTWISE:
+        if _draws(target, args, kwargs):
             raise self._refusal(f"draws random numbers ({target})", NOISE)
         given = leaves((args, kwargs))
         gone = next((value for value in given if isinstance(value, Unavailable)), None)
@@ -385,6 +385,15 @@ class Lowering:
 
     def _refusal(self, what: str, advice: str) -> InputError:
         return InputError(f"from_torch({self._name}): {place_of(self._node)} {what}: {advice}")
+
+
+def _draws(target: Any, args: Sequence[Any], kwargs: Mapping[str, Any]) -> bool:
+    """Whether an operator draws random numbers."""
+    if target is A.scaled_dot_product_attention.default:
+        return bool(args[4] if len(args) > 4 else kwargs.get("dropout_p", 0.0))
+    if target is A.rrelu_with_noise_functional.default:
+        return bool(args[4] if len(args) > 4 else kwargs.get("training", False))
+    return torch.Tag.nondeterministic_seeded in getattr(target, "tags", ())
 
 
 def _plain(given: Sequence[Any]) -> bool:

@@ -94,7 +94,6 @@ def refused_export(name: str, module: torch.nn.Module, error: Exception) -> Inpu
 
 
 EXPORT = [
-    (r"(?i)ScriptModule", "is a TorchScript module", "give the module that was scripted"),
     (
         r"(?i)nonzero|masked_select|unbacked symint.*size|dynamic output shape",
         "makes tensors whose size depends on values",
