@@ -343,6 +343,67 @@ def test_noise_is_added():
     assert outcome(task(model), {}, {"a": 0.0, "b": 0.0}).sd == pytest.approx(0.2)
 
 
+class TwoHeads(nn.Module):
+    """Mean and logarithm of the deviation, as networks that are fitted by likelihood have them."""
+
+    def __init__(self):
+        super().__init__()
+        self.body = mlp(2, 2)
+
+    def forward(self, x):
+        y = self.body(x)
+        return y[:, :1], y[:, 1:].exp()
+
+
+HEADS = {"writes": [{"y": 1}, {"s": 1}], "deviations": {"y": "s"}}
+
+
+def test_deviations_that_a_module_predicts():
+    net = TwoHeads()
+    model = from_torch(net, {"a": 1, "b": 1}, **HEADS)
+    assert model.writes == {"y": 1}
+    y, s = (float(part) for part in value(net, [[0.3, -0.4]]))
+    for compiled in (False, True):
+        found = outcome(task(model, compiled=compiled), {}, {"a": 0.3, "b": -0.4})
+        assert found.mean == pytest.approx(y, rel=1e-13)
+        assert found.sd == pytest.approx(s, rel=1e-13)
+
+
+def test_expected_deviations_of_uncertain_inputs():
+    """Against a million samples."""
+    net = TwoHeads()
+    model = sg.Model(from_torch(net, {"a": 1, "b": 1}, **HEADS), propagation="quadrature")
+    found = outcome(task(model, uncertain=("b",)), {"b": sg.Gaussian(-0.4, sd=0.5)}, {"a": 0.3})
+    b = -0.4 + 0.5 * torch.randn(1_000_000)
+    y, s = value(net, torch.stack([torch.full_like(b, 0.3), b], 1))
+    assert found.mean == pytest.approx(float(y.mean()), abs=2e-3)
+    assert found.covariance == pytest.approx(float(y.var() + (s**2).mean()), rel=5e-3)
+
+
+def test_an_ensemble_of_modules_with_deviations():
+    nets = [TwoHeads() for _ in range(3)]
+    model = from_torch(nets, {"a": 1, "b": 1}, **HEADS)
+    y, s = np.array([[float(part) for part in value(net, [[0.3, -0.4]])] for net in nets]).T
+    mean, covariance = model.predict([0.3, -0.4])
+    assert mean[0] == pytest.approx(y.mean(), rel=1e-13)
+    assert covariance[0, 0] == pytest.approx(y.var() + (s**2).mean(), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("deviations", "words"),
+    [
+        ("s", "deviations = 's'; give {label"),
+        ({"y": "t"}, "deviations name 't'. Labels in writes: 'y', 's'"),
+        ({"z": "s"}, "deviations name 'z'"),
+        ({"y": "y"}, "'y' holds the deviations of 'y'"),
+        ({"y": "s", "s": "y"}, "'s' holds the deviations of 'y', and can be nothing else"),
+    ],
+)
+def test_deviations_that_do_not_fit(deviations, words):
+    writes = [{"y": 1}, {"s": 1}]
+    refuses(lambda: from_torch(TwoHeads(), {"a": 2}, writes, deviations=deviations), sg.InputError, words)
+
+
 # Ensembles
 
 

@@ -1,4 +1,4 @@
-"""Modules of all kinds against torch.func: values and Jacobians to 1e-12, Hessians to 1e-10; and those that are refused."""
+"""Modules of all kinds against torch.func: values and Jacobians to 1e-12, Hessians to 1e-10; and what is refused."""
 
 import numpy as np
 import pytest

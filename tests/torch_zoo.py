@@ -652,6 +652,16 @@ def counted(m: nn.Module, x: Tensor) -> Tensor:
     return x * m.steps
 
 
+def energy_slope(m: nn.Module, x: Tensor) -> Tensor:
+    return torch.func.grad(lambda y: m.f(y).sum())(x)
+
+
+def slope(m: nn.Module, x: Tensor) -> Tensor:
+    with torch.enable_grad():
+        y = x.detach().requires_grad_()
+        return torch.autograd.grad(m.f(y).sum(), y, create_graph=True)[0]
+
+
 def fed(m: nn.Module, x: Tensor) -> Tensor:
     return F.batch_norm(x.view(2, 2), m.mean, m.variance, training=True).view(1, 4)
 
@@ -690,6 +700,10 @@ TROUBLES: dict[str, tuple[Callable[[], nn.Module], str]] = {
 
 REFUSED: list[Refusal] = [
     *(Refusal(name, seeded(inside(build)), ((1, 3),), "body.1", says) for name, (build, says) in TROUBLES.items()),
+    Refusal("derivative", seeded(inside(partial(Of, energy_slope, f=partial(mlp, 4, 1)))), ((1, 3),), "", "derivative"),
+    Refusal(
+        "derivative by autograd", seeded(inside(partial(Of, slope, f=partial(mlp, 4, 1)))), ((1, 3),), "", "derivative"
+    ),
     Refusal("if of the root", seeded(partial(Of, lambda m, x: -x if x[0, 0] > 0 else x)), ((1, 3),), "", "value"),
     Refusal("TorchScript", seeded(lambda: torch.jit.script(nn.Linear(3, 2))), ((1, 3),), "", "TorchScript"),
 ]

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from symgraph.compile.interpreted import FlatFunction
-from symgraph.errors import GraphError, InputError
+from symgraph.errors import GraphError, InputError, did_you_mean, names
 from symgraph.learned.inputs import checked_option, checked_rows
 from symgraph.learned.torch_modules.arguments import READS, WRITES, Tensors, matched, tensors_of
 from symgraph.learned.torch_modules.weights import LiveWeight, Source
@@ -41,11 +41,17 @@ class TorchModel:
     """
 
     def __init__(
-        self, name: str, reads: Tensors, writes: Tensors, members: Sequence[tuple[ca.Function, tuple[Parameter, ...]]]
+        self,
+        name: str,
+        reads: Tensors,
+        writes: Tensors,
+        deviations: Mapping[str, str],
+        members: Sequence[tuple[ca.Function, tuple[Parameter, ...]]],
     ) -> None:
         self.name = name
         self.reads = reads.sizes
-        self.writes = writes.sizes
+        self.writes = {label: size for label, size in writes.sizes.items() if label not in deviations.values()}
+        self._deviations = dict(deviations)
         self.propagation: str | None = None
         self._reads = reads
         self._writes = writes
@@ -135,13 +141,31 @@ class TorchModel:
             calls = rule in OVER_POINTS and bool(uncertain)  # one piece of code for all points
             made = function.call([*tensors, *weights], not calls, calls)
             y = ca.vertcat(*[made[i] for i, labels in enumerate(self._writes.labels) if labels])
-            mean, covariance = RULES[rule](y, x, sigma)
+            edges = np.cumsum([0, *self._writes.sizes.values()]).tolist()
+            parts = dict(zip(self._writes.sizes, ca.vertsplit(y, edges), strict=True))
+            variances = [parts[self._deviations[label]] ** 2 for label in self.writes if label in self._deviations]
+            mean, covariance = RULES[rule](ca.vertcat(*[parts[label] for label in self.writes], *variances), x, sigma)
+            mean, covariance = self._with_own(mean, covariance)
             inputs = [*x.values(), *sigma.values()]
             differentiable = [True] * len(inputs) + [False] * len(weights)
             self._built[key] = ca.Function(
                 "moments", [*inputs, *weights], [ca.densify(mean), covariance], {"is_diff_in": differentiable}
             )
         return self._built[key]
+
+    def _with_own(self, moments: ca.MX, covariance: ca.MX) -> tuple[ca.MX, ca.MX]:
+        """Take the expected variances that outputs have of their own from the end of the moments to the covariance."""
+        m = sum(self.writes.values())
+        mean, own = moments[:m], moments[m:]
+        covariance = covariance[:m, :m]
+        if not self._deviations:
+            return mean, covariance
+        parts, begin = [], 0
+        for label, size in self.writes.items():
+            count = size if label in self._deviations else 0
+            parts.append(own[begin : begin + count] if count else ca.MX(size, 1))
+            begin += count
+        return mean, covariance + ca.diag(ca.vertcat(*parts))
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_built": {}, "_prediction": None}
@@ -163,7 +187,14 @@ def _mixed(moments: Sequence[tuple[ca.MX, ca.MX]]) -> tuple[ca.MX, ca.MX]:
     return mean, covariance + sum(within, ca.MX(0.0)) / count if within else covariance
 
 
-def from_torch(module: Modules, reads: Any, writes: Any, *, name: str | None = None) -> TorchModel:
+def from_torch(
+    module: Modules,
+    reads: Any,
+    writes: Any,
+    *,
+    deviations: Mapping[str, str] | None = None,
+    name: str | None = None,
+) -> TorchModel:
     """Return a torch module as a model, exact to rounding, with first and second derivatives.
 
     The module is exported by `torch.export` in double precision and eval mode, and written anew as a CasADi expression
@@ -182,6 +213,8 @@ def from_torch(module: Modules, reads: Any, writes: Any, *, name: str | None = N
             index runs fastest. A module that takes several tensors gets a list of such dicts.
         writes: {label: number of elements} of what it returns, likewise; for several tensors a list of dicts, an empty
             one for what is not needed.
+        deviations: {label: label in `writes` that holds its standard deviations σ}, for outputs that are uncertain by
+            themselves. The second label is not written; E[σ²] is added to the variances of the first one.
         name: shown in messages and pictures; the module's class, if left out.
 
     Returns:
@@ -208,6 +241,7 @@ def from_torch(module: Modules, reads: Any, writes: Any, *, name: str | None = N
     name = type(modules[0]).__name__ if name is None else str(name)
     place = f"from_torch({name})"
     inputs, outputs = tensors_of(reads, f"{place}: reads", READS), tensors_of(writes, f"{place}: writes", WRITES)
+    own = _checked_deviations(deviations, outputs, place)
     from symgraph.learned.torch_modules.exporting import lowered_module
 
     members = []
@@ -219,4 +253,26 @@ def from_torch(module: Modules, reads: Any, writes: Any, *, name: str | None = N
             matched(outputs, lowered.shapes, place)
             source = Source(label, one, lowered)
             members.append((lowered.function, tuple(LiveWeight(source, weight) for weight in lowered.weights)))
-    return TorchModel(name, inputs, outputs, members)
+    return TorchModel(name, inputs, outputs, own, members)
+
+
+def _checked_deviations(given: Any, writes: Tensors, place: str) -> dict[str, str]:
+    if given is None:
+        return {}
+    if not isinstance(given, Mapping):
+        raise InputError(f"{place}: deviations = {given!r}; give {{label: label of its standard deviations}}")
+    for label, other in given.items():
+        for name in (label, other):
+            if name not in writes.sizes:
+                raise InputError(
+                    f"{place}: deviations name {name!r}{did_you_mean(name, writes.sizes)} Labels in writes: "
+                    f"{names(writes.sizes)}"
+                )
+        if other in given or list(given.values()).count(other) > 1:
+            raise InputError(f"{place}: {other!r} holds the deviations of {label!r}, and can be nothing else besides")
+        if writes.sizes[label] != writes.sizes[other]:
+            raise InputError(
+                f"{place}: {label!r} has {writes.sizes[label]} elements, its deviations {other!r} have "
+                f"{writes.sizes[other]}"
+            )
+    return dict(given)

@@ -95,6 +95,11 @@ def refused_export(name: str, module: torch.nn.Module, error: Exception) -> Inpu
 
 EXPORT = [
     (
+        r"(?i)functorch|torch\._?func|autograd\.grad|requires_grad|fake tensor in the exported program|data pointer",
+        "takes derivatives in forward",
+        "torch.export cannot follow them; write the derivative out with torch's operators",
+    ),
+    (
         r"(?i)nonzero|masked_select|unbacked symint.*size|dynamic output shape",
         "makes tensors whose size depends on values",
         SIZES,
