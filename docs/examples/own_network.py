@@ -84,8 +84,8 @@ for seed in range(4):
 # %%
 # The task
 # --------
-# :func:`symgraph.learned.from_torch` takes the list as it is. Its mean and spread are those of a mixture of the members.
-# Speed and angle stand beside each other in the row that the module takes.
+# :func:`symgraph.learned.from_torch` takes the list as it is. Its mean and spread are those of a mixture of the
+# members. Speed and angle stand beside each other in the row that the module takes.
 
 landing = sg.learned.from_torch(ensemble, reads={"speed": 1, "angle": 1}, writes={"landing": 1}, name="throw")
 

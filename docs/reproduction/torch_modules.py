@@ -1,7 +1,7 @@
 """Modules of torch as models: how exactly, what is refused, and how fast, against torch itself.
 
-From the repository's root: `python docs/reproduction/torch_modules.py`, or with the names of some parts. Each part writes a
-table to torch_modules/. All modules of the part "agreement" take half an hour.
+From the repository's root: `python docs/reproduction/torch_modules.py`, or with the names of some parts. Each part
+writes a table to torch_modules/. All modules of the part "agreement" take half an hour.
 """
 
 import csv
@@ -155,6 +155,15 @@ def seconds(call, repeats=REPEATS):
     return best
 
 
+def compared(precision, ours, torchs, unit):
+    """Columns of a table."""
+    return {
+        f"symgraph, {precision} [{unit}]": f"{ours:.1f}",
+        f"torch, {precision} [{unit}]": f"{torchs:.1f}",
+        f"torch / symgraph, {precision}": f"{torchs / ours:.1f}",
+    }
+
+
 def building():
     """Seconds until a module can be planned with: the first time, and when caches know it."""
     sg.learned.from_torch(nn.Linear(1, 1), {"x": 1}, {"y": 1})  # imports torch's exporter
@@ -192,11 +201,7 @@ def evaluation():
                 net = net.to(dtype).requires_grad_(False)
                 x = torch.tensor(points, dtype=dtype, requires_grad=True)
                 torchs = seconds(lambda n=net, x=x: torch.autograd.grad(reward(n, x).sum(), x), 200)
-                row |= {
-                    f"symgraph, {precision} [µs]": f"{ours * 1e6:.0f}",
-                    f"torch, {precision} [µs]": f"{torchs * 1e6:.0f}",
-                }
-                row[f"torch / symgraph, {precision}"] = f"{torchs / ours:.1f}"
+                row |= compared(precision, ours * 1e6, torchs * 1e6, "µs")
             rows.append(row)
             print(*row.values(), flush=True)
     write("evaluation", rows)
@@ -233,12 +238,7 @@ def planning():
                 ours = seconds(lambda o=objective, p=optimizer: sg.solve(o, {}, p, progress=False))
                 net = net.to(dtype).requires_grad_(False)
                 torchs = seconds(lambda n=net, s=starts, d=dtype: multi_start(n, s, d), 3)
-                row |= {
-                    f"symgraph, {precision} [ms]": f"{ours * 1e3:.1f}",
-                    f"torch, {precision} [ms]": f"{torchs * 1e3:.1f}",
-                }
-                row[f"torch / symgraph, {precision}"] = f"{torchs / ours:.1f}"
-                row[f"gradients, {precision}"] = work
+                row |= {"gradients": work} | compared(precision, ours * 1e3, torchs * 1e3, "ms")
             objective = task(case(name))
             sg.solve(objective, {}, progress=False)
             row["solve as it comes [ms]"] = f"{seconds(lambda o=objective: sg.solve(o, {}, progress=False)) * 1e3:.1f}"
