@@ -223,6 +223,21 @@ def test_all_ways_to_change_weights_are_seen(change):
     assert expected != before
 
 
+def test_weights_in_double_precision_are_copied():
+    """Kernels keep what follows from numbers, and must see that they are others."""
+    net = mlp().double()
+    model = from_torch(net, {"a": 1, "b": 1}, {"y": 1})
+    objective = task(model, compiled=True)
+    point = np.array([[0.5], [0.7]])
+    before, held = objective.evaluate({}, point)[0][0], [p.value for p in model.parameters]
+    copies = [value.copy() for value in held]
+    net[0].weight.data.mul_(2)
+    assert all((value == copy).all() for value, copy in zip(held, copies, strict=True))
+    after = objective.evaluate({}, point)[0][0]
+    assert after == pytest.approx(-((float(value(net, [[0.5, 0.7]])) - 0.3) ** 2), rel=1e-12)
+    assert after != before
+
+
 def test_statistics_of_batch_norms_are_weights_too():
     net = nn.Sequential(nn.Linear(2, 4), nn.BatchNorm1d(4), nn.Tanh(), nn.Linear(4, 1))
     model = from_torch(net, {"a": 1, "b": 1}, {"y": 1})

@@ -36,7 +36,10 @@ def find(key: str) -> Lowered | None:
                 ca.Function.deserialize(document["function"]),
                 tuple(tuple(shape) for shape in document["shapes"]),
                 Tape(document["steps"]),
-                tuple(Weight(name, step, (rows, columns)) for name, step, rows, columns in document["weights"]),
+                tuple(
+                    Weight(tuple(sources), step, (rows, columns))
+                    for sources, step, rows, columns in document["weights"]
+                ),
                 tuple(document["kept"]),
                 document["halved"],
             )
@@ -52,7 +55,7 @@ def keep(key: str, lowered: Lowered) -> None:
         "function": lowered.function.serialize(),
         "shapes": lowered.shapes,
         "steps": lowered.tape.steps,
-        "weights": [(w.name, w.step, *w.shape) for w in lowered.weights],
+        "weights": [(w.sources, w.step, *w.shape) for w in lowered.weights],
         "kept": lowered.kept,
         "halved": lowered.halved,
     }

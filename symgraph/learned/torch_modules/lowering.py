@@ -120,12 +120,12 @@ class Weight:
     """An input of the lowered function: what to read it from, and its shape in CasADi.
 
     Attributes:
-        name: of the parameter or buffer, or of what is made of several.
+        sources: names of the parameters and buffers that it follows from.
         step: of the tape.
         shape: (rows, columns).
     """
 
-    name: str
+    sources: tuple[str, ...]
     step: int
     shape: tuple[int, int]
 
@@ -273,14 +273,10 @@ class Lowering:
             numbers = value.value
             rows = numbers.shape[-1] if numbers.ndim else 1
             shape = rows, numbers.numel() // rows if rows else 0
-            weight = Weight(self._weight_name(value.step), value.step, shape)
+            weight = Weight(tuple(dict.fromkeys(self._ancestors(value.step))), value.step, shape)
             column = ca.MX.sym("w", numbers.numel())
             self._symbols[value.step] = weight, Symbol(column, tuple(numbers.shape), fixed=True)
         return self._symbols[value.step][1]
-
-    def _weight_name(self, step: int) -> str:
-        names = dict.fromkeys(self._ancestors(step))
-        return " + ".join(names)
 
     def _ancestors(self, step: int) -> Iterator[str]:
         if step in self._sources:

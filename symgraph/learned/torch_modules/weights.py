@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from functools import reduce
 from typing import TYPE_CHECKING, Any
 
@@ -33,24 +34,26 @@ class Source:
         self._tape: Tape = lowered.tape
         self._kept = {kept: self._state(kept).clone() for kept in lowered.kept}
 
-    def read(self, step: int) -> torch.Tensor:
-        """Return a step of the tape for the weights of this moment, in double precision.
+    def states(self, names: Sequence[str]) -> dict[str, torch.Tensor]:
+        """Return parameters and buffers of this moment as they are.
 
         Raises:
-            InputError: the module has lost a weight, or has changed a constant, since it was exported.
+            InputError: the module has lost one, or has changed a constant, since it was exported.
         """
         for name, value in self._kept.items():
-            if not value.equal(self._state(name)):
+            if not _same(value, self._state(name)):
                 raise InputError(
                     f"{self.name}: the buffer {name!r} was a constant when the module was exported, and has changed; "
                     f"call from_torch again"
                 )
-        return self._tape.run(step, self._double)  # type: ignore[no-any-return]  # a tensor where a weight is
+        return {name: self._state(name) for name in names}
 
-    def _double(self, name: str) -> torch.Tensor:
+    def read(self, step: int, states: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Return a step of the tape, computed in double precision."""
         import torch
 
-        return self._state(name).to("cpu", torch.float64)
+        double = {name: state.to("cpu", torch.float64) for name, state in states.items()}
+        return self._tape.run(step, double.__getitem__)  # type: ignore[no-any-return]  # a tensor where a weight is
 
     def _state(self, name: str) -> torch.Tensor:
         try:
@@ -74,29 +77,38 @@ class LiveWeight(Parameter):
     def __init__(self, source: Source, weight: Weight) -> None:
         self._source = source
         self._weight = weight
-        super().__init__(self._read(), f"{source.name}.{weight.name}")
+        states = source.states(weight.sources)
+        super().__init__(self._computed(states), f"{source.name}.{' + '.join(weight.sources)}")
+        self._seen = {name: state.clone() for name, state in states.items()}
 
     @property
     def value(self) -> Array:
         """The numbers, in the shape of the symbol; train the module to change them."""
-        new = self._read()
-        if not np.array_equal(new, self._value):
-            self._value = self._checked(new)
+        states = self._source.states(self._weight.sources)
+        # Numbers are compared: there are ways to change a tensor that its version does not tell.
+        if not all(_same(state, self._seen[name]) for name, state in states.items()):
+            self._value = self._checked(self._computed(states))
+            self._seen = {name: state.clone() for name, state in states.items()}
         return self._value
 
     @value.setter
     def value(self, value: Any) -> None:
         raise InputError(f"parameter {self.name!r} is read from a torch module: change its weights there")
 
-    def _read(self) -> Array:
+    def _computed(self, states: Mapping[str, torch.Tensor]) -> Array:
         rows, columns = self._weight.shape
-        numbers = self._source.read(self._weight.step)
+        numbers = self._source.read(self._weight.step, states)
         if numbers.numel() != rows * columns:
+            names = " + ".join(self._weight.sources)
             raise InputError(
-                f"{self._source.name}: the weights {self._weight.name!r} have {numbers.numel()} elements, and had "
-                f"{rows * columns} when the module was exported; call from_torch again"
+                f"{self._source.name}: the weights {names!r} have {numbers.numel()} elements, and had {rows * columns} "
+                f"when the module was exported; call from_torch again"
             )
-        return numbers.contiguous().numpy().reshape(columns, rows).T
+        return np.array(numbers.contiguous().numpy().reshape(columns, rows)).T  # a copy: training goes on in place
 
     def __reduce__(self) -> tuple[Any, ...]:  # to other processes go the numbers of now, which need no torch there
         return Parameter, (self.value, self.name)
+
+
+def _same(one: torch.Tensor, other: torch.Tensor) -> bool:
+    return one.dtype == other.dtype and one.device == other.device and one.shape == other.shape and one.equal(other)
