@@ -14,102 +14,25 @@ import torch
 from torch.export.graph_signature import InputKind, OutputKind
 
 from symgraph.errors import InputError
-from symgraph.learned.torch_modules.layers import COMPOSED, PLAIN, Unavailable
+from symgraph.learned.torch_modules.layers import COMPOSED, PLAIN
 from symgraph.learned.torch_modules.reductions import REDUCTIONS
 from symgraph.learned.torch_modules.refusals import NOISE, advice_on, place_of
 from symgraph.learned.torch_modules.scalars import ELEMENTWISE
-from symgraph.learned.torch_modules.symbols import Symbol, constant, gather, leaves, linear, mapped, moved
+from symgraph.learned.torch_modules.symbols import (
+    LINEAR,
+    MOVES,
+    Symbol,
+    Unavailable,
+    constant,
+    gather,
+    leaves,
+    linear,
+    mapped,
+    moved,
+)
 from symgraph.learned.torch_modules.tape import Derived, Tape, is_operator
 
 A = torch.ops.aten
-
-# Operators that move, repeat or drop numbers, or fill up with zeros.
-MOVES = {
-    A.view.default,
-    A._unsafe_view.default,
-    A.reshape.default,
-    A.permute.default,
-    A.transpose.int,
-    A.t.default,
-    A.unsqueeze.default,
-    A.squeeze.default,
-    A.squeeze.dim,
-    A.squeeze.dims,
-    A.expand.default,
-    A.clone.default,
-    A.alias.default,
-    A.detach.default,
-    A.lift_fresh_copy.default,
-    A.select.int,
-    A.slice.Tensor,
-    A.narrow.default,
-    A.cat.default,
-    A.stack.default,
-    A.split.Tensor,
-    A.split_with_sizes.default,
-    A.unbind.int,
-    A.chunk.default,
-    A.index.Tensor,
-    A.index_select.default,
-    A.gather.default,
-    A.take_along_dim.default,
-    A.flip.default,
-    A.roll.default,
-    A.repeat.default,
-    A.repeat_interleave.self_int,
-    A.as_strided.default,
-    A.unfold.default,
-    A.diagonal.default,
-    A.diag_embed.default,
-    A.tril.default,
-    A.triu.default,
-    A.rot90.default,
-    A.pixel_shuffle.default,
-    A.pixel_unshuffle.default,
-    A.channel_shuffle.default,
-    A.select_scatter.default,
-    A.slice_scatter.default,
-    A.diagonal_scatter.default,
-    A.scatter.src,
-    A.index_put.default,
-    A.copy.default,
-    A.im2col.default,
-    A.reflection_pad1d.default,
-    A.reflection_pad2d.default,
-    A.reflection_pad3d.default,
-    A.replication_pad1d.default,
-    A.replication_pad2d.default,
-    A.replication_pad3d.default,
-    A.upsample_nearest1d.default,
-    A.upsample_nearest2d.default,
-    A.upsample_nearest3d.default,
-    A.upsample_nearest1d.vec,
-    A.upsample_nearest2d.vec,
-    A.upsample_nearest3d.vec,
-}
-
-# Operators that are linear in their tensors, with constant coefficients.
-LINEAR = {
-    A.avg_pool1d.default,
-    A.avg_pool2d.default,
-    A.avg_pool3d.default,
-    A.adaptive_avg_pool1d.default,
-    A._adaptive_avg_pool2d.default,
-    A._adaptive_avg_pool3d.default,
-    A.upsample_linear1d.default,
-    A.upsample_linear1d.vec,
-    A.upsample_bilinear2d.default,
-    A.upsample_bilinear2d.vec,
-    A._upsample_bilinear2d_aa.default,
-    A.upsample_bicubic2d.default,
-    A.upsample_bicubic2d.vec,
-    A.upsample_trilinear3d.vec,
-    A.cumsum.default,
-    A.col2im.default,
-    A.scatter_add.default,
-    A.index_add.default,
-    A.trace.default,
-}
 
 # Named arguments that say how torch keeps numbers, not what they are.
 STORAGE = {"dtype", "layout", "device", "pin_memory", "memory_format", "requires_grad"}

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from symgraph.learned.torch_modules.scalars import logaddexp, where
-from symgraph.learned.torch_modules.symbols import Shape, Symbol, indices
+from symgraph.learned.torch_modules.symbols import Shape, Symbol, Unavailable, indices
 
 A = torch.ops.aten
 
@@ -164,6 +164,15 @@ def _of_some(form: Callable[[ca.MX], ca.MX]) -> Callable[..., Symbol]:
     return lambda x, dims=None, keepdim=False: reduced(x, dims, keepdim, form)
 
 
+def _extreme_and_place(form: Callable[[ca.MX], ca.MX]) -> Callable[..., list[Any]]:
+    """Return the operator that makes the extremes along a dimension, and whose places nobody may use."""
+
+    def operator(x: Symbol, dim: int, keepdim: bool = False) -> list[Any]:
+        return [reduced(x, dim, keepdim, form), Unavailable("the places of the extremes")]
+
+    return operator
+
+
 def _along_one(form: Callable[[ca.MX], ca.MX]) -> Callable[..., Symbol]:
     return lambda x, dim, half_to_float=False: along(x, dimensions(x, dim), form) if x.shape else along_scalar(x, form)
 
@@ -193,6 +202,8 @@ REDUCTIONS: dict[Any, Callable[..., Any]] = {
     A.prod.dim_int: _of_some(product),
     A.amax.default: _of_some(largest),
     A.amin.default: _of_some(smallest),
+    A.max.dim: _extreme_and_place(largest),
+    A.min.dim: _extreme_and_place(smallest),
     A.max.default: _of_all(largest),
     A.min.default: _of_all(smallest),
     A.any.default: _of_all(lambda matrix: largest(ca.ne(matrix, 0))),
