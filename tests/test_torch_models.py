@@ -179,6 +179,25 @@ def test_a_slot_of_another_size():
     refuses(lambda: graph.edge("s", "e", model), sg.GraphError, "flow reads 'a' with size 2, the slot has size 3")
 
 
+class Cast(nn.Module):
+    def __init__(self, back):
+        super().__init__()
+        self.linear, self.back = nn.Linear(2, 1), back
+
+    def forward(self, x):
+        scaled = x.float() * 0.1
+        return self.linear(scaled.to(x.dtype) if self.back else scaled)
+
+
+def test_precisions_within_a_module():
+    net = Cast(back=True)
+    model = from_torch(net, {"a": 2}, {"y": 1})
+    scaled = 0.1 * np.array([[0.3, 0.4]])  # in double precision all the way
+    np.testing.assert_allclose(model.predict([0.3, 0.4])[0], value(net.linear, scaled)[0], rtol=1e-14)
+    words = "module 'linear' (Linear)", "mixes precisions", "dtype=x.dtype"
+    refuses(lambda: from_torch(Cast(back=False), {"a": 2}, {"y": 1}), sg.InputError, *words)
+
+
 # Weights
 
 

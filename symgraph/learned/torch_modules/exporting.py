@@ -133,13 +133,13 @@ def _lowered_module(module: torch.nn.Module, shapes: Sequence[tuple[int, ...]], 
     found = cache.find(key)
     if found is not None:
         try:
-            if _difference(found, twin, shapes) <= _tolerance(found):
+            if _difference(found, twin, shapes, name) <= _tolerance(found):
                 return found
         except (SymgraphError, RuntimeError, NotImplementedError, ValueError, LookupError, AttributeError):
             pass  # the file was damaged, or another module's: it is made anew
         cache.forget(key)
     lowered = Lowering(name).run(exported(twin, shapes, name), shapes)
-    difference = _difference(lowered, twin, shapes)
+    difference = _difference(lowered, twin, shapes, name)
     if not difference <= _tolerance(lowered):
         raise InputError(
             f"from_torch({name}): the expression differs from the module by {difference:.1e} at random inputs; a "
@@ -154,7 +154,7 @@ def _tolerance(lowered: Lowered) -> float:
     return 1e-4 if lowered.halved else 1e-9
 
 
-def _difference(lowered: Lowered, twin: torch.nn.Module, shapes: Sequence[tuple[int, ...]]) -> float:
+def _difference(lowered: Lowered, twin: torch.nn.Module, shapes: Sequence[tuple[int, ...]], name: str) -> float:
     """Return by how much a function differs from the module at random inputs, relative to the largest output."""
     source = Source("", twin, lowered)
     weights = [ca.DM(LiveWeight(source, weight).value) for weight in lowered.weights]
@@ -163,7 +163,11 @@ def _difference(lowered: Lowered, twin: torch.nn.Module, shapes: Sequence[tuple[
         for seed in range(POINTS):
             generator = torch.Generator().manual_seed(seed)
             inputs = tuple(torch.randn(shape, generator=generator) for shape in shapes)
-            expected = [part for part in leaves(twin(*inputs)) if isinstance(part, torch.Tensor)]
+            try:
+                made = twin(*inputs)
+            except Exception as error:  # export does not see everything
+                raise refused_export(name, twin, error) from error
+            expected = [part for part in leaves(made) if isinstance(part, torch.Tensor)]
             found = lowered.function.call([*(ca.DM(x.flatten().numpy()) for x in inputs), *weights])
             for one, other in zip(found, expected, strict=True):
                 here, there = np.array(one).ravel(), other.numpy().ravel()
