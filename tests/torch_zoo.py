@@ -46,10 +46,11 @@ class Refusal(Entry):
 
 
 class TwiceDifferentiable(TorchFunctionMode):
-    """Formulas in place of the kernels that torch.func differentiates only once."""
+    """Formulas in place of kernels that torch.func differentiates only once, or with constants in single precision."""
 
     FORMULAS = {  # noqa: RUF012
         F.hardsigmoid: lambda x, **_: F.relu6(x + 3) / 6,
+        F.celu: lambda x, alpha=1.0, *_, **__: torch.where(x > 0, x, alpha * torch.expm1(x.clamp(max=0) / alpha)),
         F.rrelu: lambda x, lower, upper, *_, **__: F.leaky_relu(x, (lower + upper) / 2),
         torch.cdist: lambda x, y, **_: (x.unsqueeze(-2) - y.unsqueeze(-3)).norm(dim=-1),
     }
