@@ -89,9 +89,9 @@ class Situation:
     means: Array
     covariances: Array
 
-    @property
+    @cached_property
     def shared(self) -> list[Array]:
-        """The inputs after actions and selections, with the parameters' values of this moment."""
+        """The inputs after actions and selections, with the parameters' values when they are first asked for."""
         parameters = self.build.expectation.inputs.parameters
         return [self.means, self.covariances, *(p.value.ravel(order="F") for p in parameters)]
 

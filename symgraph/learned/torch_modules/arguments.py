@@ -77,12 +77,14 @@ def _shape(given: Any, place: str) -> Shape:
     return tuple(int(n) for n in parts)
 
 
-def matched(writes: Tensors, shapes: Sequence[Shape], place: str) -> None:
-    """Check that labels fit what a module returns.
+def matched(writes: Tensors, shapes: Sequence[Shape], keys: Sequence[str], place: str) -> Tensors:
+    """Return the labels of each tensor that a module returns, by the keys of its dict where those are the labels.
 
     Raises:
         InputError: another number of tensors or of elements, or a label twice.
     """
+    if keys and set(keys) == set(writes.sizes):
+        writes = Tensors(tuple((key,) for key in keys), (), {key: writes.sizes[key] for key in keys})
     returned = ", ".join(str(shape) for shape in shapes)
     if len(shapes) != len(writes.labels):
         raise InputError(
@@ -95,10 +97,11 @@ def matched(writes: Tensors, shapes: Sequence[Shape], place: str) -> None:
         size = sum(writes.sizes[label] for label in labels)
         if labels and size != math.prod(shape):
             raise InputError(
-                f"{place}: {names(labels)} have {size} elements, the module returns {math.prod(shape)} "
-                f"(a tensor of shape {shape}) for them"
+                f"{place}: writes gives {size} elements to {names(labels)}, the module returns {math.prod(shape)} "
+                f"there, a tensor of shape {shape}"
             )
         twice = seen & set(labels)
         if twice:
             raise InputError(f"{place}: writes names {names(twice)} twice; give another label to one of them")
         seen |= set(labels)
+    return writes

@@ -13,8 +13,8 @@ import casadi as ca
 import numpy as np
 import torch
 
-from symgraph.learned.torch_modules.reductions import along, mean, repeated, softmax, total
-from symgraph.learned.torch_modules.symbols import Call, Symbol, Unavailable, gather, indices
+from symgraph.learned.torch_modules.reductions import along, mean, repeated, softmax, softmax_where, total
+from symgraph.learned.torch_modules.symbols import Call, Symbol, Unavailable, gather, indices, is_boolean
 from symgraph.learned.torch_modules.windows import adaptive_max_pool, convolution, max_pool
 
 A = torch.ops.aten
@@ -207,8 +207,10 @@ def _repeated_heads(call: Call, x: Any, times: int) -> Any:
 
 
 def _masked_softmax(call: Call, scores: Any, mask: Any) -> Any:
+    if mask is None:
+        return call(A._softmax.default, scores, -1, False)
     if not isinstance(mask, torch.Tensor):
-        return call(A._softmax.default, scores if mask is None else call(A.add.Tensor, scores, mask), -1, False)
+        return _softmax_where_seen(call, scores, mask)
     seen = mask if mask.dtype == torch.bool else mask > -math.inf
     if mask.dtype != torch.bool:
         scores = call(A.add.Tensor, scores, torch.where(seen, mask, 0.0))
@@ -225,6 +227,20 @@ def _masked_softmax(call: Call, scores: Any, mask: Any) -> Any:
             places[i, where] = begin + np.arange(len(where))
             begin += len(where)
     return gather(rows, places.reshape(scores.shape))
+
+
+def _softmax_where_seen(call: Call, scores: Any, mask: Any) -> Any:
+    """Return the softmax under a mask that follows from inputs or weights."""
+    shape = scores.shape
+    zero = torch.zeros(shape, dtype=torch.float64)
+    boolean = call(A.logical_not.default, call(A.eq.Scalar, mask, 0 if is_boolean(mask) else -math.inf))
+    seen = call(A.logical_and.default, boolean, torch.ones(shape, dtype=torch.bool))  # of the shape of the scores
+    if not is_boolean(mask):
+        scores = call(A.add.Tensor, scores, call(A.where.self, seen, mask, zero))
+    scores = call(A.add.Tensor, scores, zero)
+    last = [len(shape) - 1]
+    numbers, _ = seen.ordered(last)
+    return along(scores, last, lambda matrix: softmax_where(numbers, matrix))
 
 
 # Of symbolic tensors alone.

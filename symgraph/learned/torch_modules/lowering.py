@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -13,10 +13,18 @@ import numpy as np
 import torch
 from torch.export.graph_signature import InputKind, OutputKind
 
-from symgraph.errors import InputError
+from symgraph.errors import InputError, SymgraphError
 from symgraph.learned.torch_modules.layers import COMPOSED, PLAIN
 from symgraph.learned.torch_modules.reductions import REDUCTIONS
-from symgraph.learned.torch_modules.refusals import NOISE, advice_on, place_of
+from symgraph.learned.torch_modules.refusals import (
+    COMPLEX,
+    EMBEDDING,
+    NOISE,
+    OTHERWISE,
+    SIZES,
+    advice_on,
+    place_of,
+)
 from symgraph.learned.torch_modules.scalars import ELEMENTWISE
 from symgraph.learned.torch_modules.symbols import (
     LINEAR,
@@ -25,6 +33,7 @@ from symgraph.learned.torch_modules.symbols import (
     Unavailable,
     constant,
     gather,
+    is_boolean,
     leaves,
     linear,
     mapped,
@@ -63,7 +72,8 @@ class Lowered:
         tape: what torch computes from weights.
         weights: the function's inputs after those of the module.
         kept: names of buffers that became constants.
-        halved: whether it computes with less than double precision somewhere inside.
+        names: of the outputs, where the module returns a dict of tensors.
+        coarsest: the rounding of the coarsest precision that the module asks for inside; 0 for double throughout.
     """
 
     function: ca.Function
@@ -71,7 +81,8 @@ class Lowered:
     tape: Tape
     weights: tuple[Weight, ...]
     kept: tuple[str, ...]
-    halved: bool
+    names: tuple[str, ...]
+    coarsest: float
 
 
 class Lowering:
@@ -81,9 +92,8 @@ class Lowering:
         self._name = name
         self._tape = Tape()
         self._symbols: dict[int, tuple[Weight, Symbol]] = {}
-        self._sources: dict[int, str] = {}
         self._kept: list[str] = []
-        self._halved = False
+        self._coarsest = 0.0
         self._node: Any = None
 
     def run(self, program: Any, shapes: Sequence[tuple[int, ...]]) -> Lowered:
@@ -110,16 +120,18 @@ class Lowering:
                     known[node] = None
                 else:
                     name = source.target
-                    known[node] = self._state(name, state[name].detach(), name in program.state_dict)
+                    known[node] = self._state(name, state[name], name in program.state_dict)
             elif node.op == "call_function":
                 args, kwargs = (torch.fx.node.map_arg(part, known.__getitem__) for part in (node.args, node.kwargs))
-                known[node] = self.call(node.target, *args, **kwargs)
+                known[node] = _typed(self._tried(node.target, args, kwargs), node.meta.get("val"))
             elif node.op == "output":
                 made = torch.fx.node.map_arg(node.args[0], known.__getitem__)
                 results = [result for result, is_wanted in zip(made, wanted, strict=True) if is_wanted]
             else:  # "get_attr": what operators of higher order call
                 known[node] = node.target
-        outputs = [self.lift(result) for result in leaves(results) if result is not None]
+        outputs = [self.lift(result) for result in leaves(results) if not isinstance(result, (str, type(None)))]
+        if not outputs:
+            raise InputError(f"from_torch({self._name}): the module returns no tensor")
         weights = [self._symbols[step] for step in sorted(self._symbols)]
         arguments = [*inputs, *(symbol.column for _, symbol in weights)]
         matrices = [ca.MX.sym(f"w{i}", *weight.shape) for i, (weight, _) in enumerate(weights)]
@@ -141,20 +153,30 @@ class Lowering:
             self._tape,
             tuple(weight for weight, _ in weights),
             tuple(self._kept),
-            self._halved,
+            _names(program.call_spec.out_spec),
+            self._coarsest,
         )
 
     def _state(self, name: str, value: torch.Tensor, belongs: bool) -> Any:
         """Return a parameter or buffer: numbers that may change, or a constant."""
         if not belongs:  # a tensor that is no parameter and no buffer
-            return value
-        if not value.is_floating_point() or (not value.isfinite().all() and not value.requires_grad):
-            if self._node.users:
-                self._kept.append(name)
-            return value
-        derived = self._tape.state(name, value)
-        self._sources[derived.step] = name
-        return derived
+            return value.detach()
+        if value.is_floating_point() and (value.requires_grad or value.isfinite().all()):
+            return self._tape.state(name, value.detach())
+        if self._node.users:
+            self._kept.append(name)
+        return value.detach()
+
+    def _tried(self, target: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
+        try:
+            return self.call(target, *args, **kwargs)
+        except SymgraphError:
+            raise
+        except Exception as error:
+            said = str(error).strip().splitlines()[-1:]
+            raise self._refusal(
+                f"calls {target} in a way that has no expression ({type(error).__name__}: {' '.join(said)})", OTHERWISE
+            ) from error
 
     def call(self, target: Any, *args: Any, **kwargs: Any) -> Any:
         """Carry out an operator: as an expression, on the tape, or at once where all is constant.
@@ -181,8 +203,7 @@ class Lowering:
             raise self._refusal(f"calls {target}", advice_on(target))
         if any(isinstance(value, Derived) for value in given):
             return self._tape.call(target, args, kwargs)
-        with torch.no_grad():
-            return target(*args, **kwargs)
+        return _in_numbers(target, args, kwargs)
 
     def lift(self, value: Any) -> Symbol:
         """Return a tensor as an expression: of a weight's symbol, or a constant."""
@@ -194,72 +215,76 @@ class Lowering:
             return constant(value)
         if value.step not in self._symbols:
             numbers = value.value
+            if not numbers.isfinite().all():
+                names = " + ".join(value.sources)
+                raise self._refusal(f"makes numbers of {names!r} that are not finite", "weights must be finite")
             rows = numbers.shape[-1] if numbers.ndim else 1
             shape = rows, numbers.numel() // rows if rows else 0
-            weight = Weight(tuple(dict.fromkeys(self._ancestors(value.step))), value.step, shape)
+            weight = Weight(value.sources, value.step, shape)
             column = ca.MX.sym("w", numbers.numel())
-            self._symbols[value.step] = weight, Symbol(column, tuple(numbers.shape), fixed=True)
+            self._symbols[value.step] = (
+                weight,
+                Symbol(column, tuple(numbers.shape), fixed=True, boolean=numbers.dtype == torch.bool),
+            )
         return self._symbols[value.step][1]
-
-    def _ancestors(self, step: int) -> Iterator[str]:
-        if step in self._sources:
-            yield self._sources[step]
-        for part in _steps_in(self._tape.steps[step][1:]):
-            yield from self._ancestors(part)
 
     def _symbolic(self, target: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
         if target is A._to_copy.default:
             return self._cast(args[0], kwargs.get("dtype"))
+        self._take_note_of(kwargs.get("dtype"))
         settings = {key: value for key, value in kwargs.items() if key not in STORAGE}
+        if all(value.size == 0 for value in leaves((args, kwargs)) if isinstance(value, Symbol)):
+            return _in_numbers(target, args, kwargs)  # of no number at all
+        if target is A.add.Tensor and all(map(is_boolean, args)):
+            target = A.logical_or.default
+        if target in BITWISE and not all(map(is_boolean, args)):
+            raise self._refusal(f"calls {target} on whole numbers", OTHERWISE)
+        if target is A.scatter.value:
+            x, dim, index, value = args
+            return self.call(A.scatter.src, x, dim, index, torch.full(index.shape, float(value), dtype=torch.float64))
         if target in ELEMENTWISE:
             return self._elementwise(target, args, settings)
         if target is A.index_put.default and len(args) > 3 and args[3]:  # it adds
-            return linear(target, *self._lifted(target, args, {}))
+            return linear(target, self._placed(target, args), {})
         if target in MOVES:
-            return self._moved(target, args, kwargs)
+            return moved(target, self._placed(target, args), {k: v for k, v in kwargs.items() if k not in STORAGE})
         if target is A.constant_pad_nd.default:
             return self._padded(*args)
         if target in LINEAR:
-            return linear(target, *self._lifted(target, args, settings))
+            return linear(target, self._placed(target, args), settings)
         if target in REDUCTIONS:
-            return REDUCTIONS[target](*self._lifted(target, args, {})[0], **settings)
+            return REDUCTIONS[target](*self._lifted(args), **settings)
         if target in PLAIN:
-            return PLAIN[target](*self._lifted(target, args, {})[0], **settings)
+            return PLAIN[target](*self._lifted(args), **settings)
         if target in COMPOSED:
             first, *others = args
             first = first if first is None else self.lift(first)
+            # A mask that follows from weights may change; what else does is left to the tape as far as that goes.
+            others = [self.lift(a) if isinstance(a, Derived) and is_boolean(a) else a for a in others]
+            settings = {k: self.lift(a) if isinstance(a, Derived) and is_boolean(a) else a for k, a in settings.items()}
             return COMPOSED[target](self.call, first, *others, **settings)
         if target in FILLED:
             return FILLED[target](*args, **settings)
         raise self._refusal(f"calls {target}", advice_on(target))
 
-    def _lifted(self, target: Any, args: Any, kwargs: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Return arguments with all tensors of real numbers as expressions; those that choose must be constants."""
+    def _lifted(self, args: Any) -> Any:
+        """Return arguments with all tensors as expressions."""
+        return mapped(lambda a: self.lift(a) if isinstance(a, (torch.Tensor, Derived)) else a, args)
 
-        def lifted(value: Any) -> Any:
-            if isinstance(value, Derived) and not value.value.is_floating_point():
-                advice = "indices and masks must be constants; keep them in buffers of whole numbers or booleans"
-                raise self._refusal(f"chooses by what follows from weights ({target})", advice)
-            if isinstance(value, Derived) or (isinstance(value, torch.Tensor) and value.is_floating_point()):
-                return self.lift(value)
-            return value
-
-        return mapped(lifted, args), mapped(lifted, kwargs)
-
-    def _moved(self, target: Any, args: Any, kwargs: dict[str, Any]) -> Any:
-        given, named = self._lifted(target, args, kwargs)
-        chosen = _index_arguments(target, given)
-        if any(isinstance(value, Symbol) for value in leaves(chosen)):
-            raise self._refusal(f"reads where its input says ({target})", advice_on(A.embedding.default))
-        named = {key: value for key, value in named.items() if key not in ("dtype", "device", "layout", "pin_memory")}
-        return moved(target, given, named)
+    def _placed(self, target: Any, args: Sequence[Any]) -> list[Any]:
+        """Return arguments with all tensors as expressions, but for those that say which numbers to take."""
+        position = INDEXED.get(target)
+        if position is not None and any(isinstance(a, (Symbol, Derived)) for a in leaves(args[position])):
+            boolean = any(is_boolean(a) for a in leaves(args[position]))
+            raise self._refusal(f"chooses by values ({target})", SIZES if boolean else EMBEDDING)
+        return [a if i == position else self._lifted(a) for i, a in enumerate(args)]
 
     def _padded(self, x: Symbol, pad: Sequence[int], value: float = 0.0) -> Symbol:
         made = moved(A.constant_pad_nd.default, (x, pad), {})
         if value == 0:
             return made  # type: ignore[no-any-return]  # one tensor in, one out
-        inside = A.constant_pad_nd.default(torch.zeros(x.shape, dtype=torch.float64), pad, 1.0)
-        return self.call(A.add.Tensor, made, inside * value)  # type: ignore[no-any-return]  # likewise
+        outside = A.constant_pad_nd.default(torch.zeros(x.shape), pad, 1.0) > 0
+        return self._chosen(outside, constant(value), made)
 
     def _elementwise(self, target: Any, args: Sequence[Any], settings: dict[str, Any]) -> Any:
         condition = args[0]
@@ -291,16 +316,22 @@ class Lowering:
 
     def _cast(self, x: Any, dtype: torch.dtype | None) -> Any:
         x = self.lift(x)
-        if dtype is None or dtype == torch.bool:
-            return x if dtype is None else self.call(A.ne.Scalar, x, 0)
-        if not dtype.is_floating_point:
+        if dtype == torch.bool:
+            return self.call(A.ne.Scalar, x, 0)
+        if dtype is not None and dtype.is_complex:
+            raise self._refusal("makes complex numbers (aten._to_copy)", COMPLEX)
+        if dtype is not None and not dtype.is_floating_point and not x.boolean:
             raise self._refusal(
                 f"makes {str(dtype).removeprefix('torch.')} of real numbers (aten._to_copy)",
                 "a rounded number has no slope; if it chooses among few things, make it a selection, whose one-hot "
                 "column times a matrix is an embedding",
             )
-        self._halved |= dtype != torch.float64
+        self._take_note_of(dtype)
         return x
+
+    def _take_note_of(self, dtype: torch.dtype | None) -> None:
+        if dtype is not None and dtype.is_floating_point and dtype != torch.float64:
+            self._coarsest = max(self._coarsest, torch.finfo(dtype).eps)
 
     def _refusal(self, what: str, advice: str) -> InputError:
         return InputError(f"from_torch({self._name}): {place_of(self._node)} {what}: {advice}")
@@ -315,27 +346,51 @@ def _draws(target: Any, args: Sequence[Any], kwargs: Mapping[str, Any]) -> bool:
     return torch.Tag.nondeterministic_seeded in getattr(target, "tags", ())
 
 
+def _names(specification: Any) -> tuple[str, ...]:
+    """Return the keys of a dict of tensors."""
+    flat = specification.type is dict and specification.num_leaves == specification.num_children
+    return tuple(map(str, specification.context)) if flat else ()
+
+
 def _plain(given: Sequence[Any]) -> bool:
     return all(isinstance(value, (int, float)) for value in given)
 
 
-def _steps_in(tree: Any) -> Iterator[int]:
-    if isinstance(tree, list):
-        for branch in tree:
-            yield from _steps_in(branch)
-    elif isinstance(tree, dict):
-        if "step" in tree:
-            yield tree["step"]
-        else:
-            yield from _steps_in(list(tree.values()))
+def _in_numbers(target: Any, args: Any, kwargs: Any) -> Any:
+    """Carry out an operator on constants, and on tensors without numbers."""
+
+    def numbers(value: Any) -> Any:
+        if isinstance(value, Symbol):
+            return torch.zeros(value.shape, dtype=torch.float64)
+        return value.value if isinstance(value, Derived) else value
+
+    with torch.no_grad():
+        return target(*mapped(numbers, args), **mapped(numbers, kwargs))
 
 
-def _index_arguments(target: Any, args: Any) -> Any:
-    """Return the arguments of an operator that say which numbers to take."""
-    if target in (A.index.Tensor, A.index_put.default):
-        return args[1]
-    return args[2] if target in (A.index_select.default, A.gather.default, A.scatter.src) else []
+def _typed(made: Any, said: Any) -> Any:
+    """Note of symbolic tensors whether torch holds them for booleans."""
+    if isinstance(made, list):
+        return [_typed(part, one) for part, one in zip(made, said, strict=False)] if said is not None else made
+    if isinstance(made, Symbol) and isinstance(said, torch.Tensor):
+        return replace(made, boolean=said.dtype == torch.bool)
+    return made
 
+
+# Which argument of an operator says what numbers to take.
+INDEXED = {
+    A.index.Tensor: 1,
+    A.index_put.default: 1,
+    A.take_along_dim.default: 1,
+    A.index_select.default: 2,
+    A.gather.default: 2,
+    A.scatter.src: 2,
+    A.scatter_add.default: 2,
+    A.index_add.default: 2,
+}
+
+# Operators that mean something else for whole numbers.
+BITWISE = {A.bitwise_not.default, A.bitwise_and.Tensor, A.bitwise_or.Tensor, A.bitwise_xor.Tensor}
 
 # Operators that check what export has checked already.
 CHECKS = {
@@ -357,4 +412,17 @@ FILLED: dict[Any, Callable[..., Any]] = {
     A.new_empty.default: lambda x, shape: torch.zeros(shape, dtype=torch.float64),
     A.sym_size.int: lambda x, dim: x.shape[dim],
     A.empty_like.default: lambda x: torch.zeros(x.shape, dtype=torch.float64),
+}
+
+# What is lowered as it is, and not taken apart by torch before.
+KNOWN = {
+    *ELEMENTWISE,
+    *MOVES,
+    *LINEAR,
+    *REDUCTIONS,
+    *PLAIN,
+    *COMPOSED,
+    *FILLED,
+    A.constant_pad_nd.default,
+    A.scatter.value,
 }

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     Modules = torch.nn.Module | Sequence[torch.nn.Module]
 
+SIGNS = 5  # random inputs at which deviations must not be negative
 OVER_POINTS = ("unscented", "quadrature")  # rules that evaluate a module many times
 
 
@@ -109,6 +110,7 @@ class TorchModel:
             InputError: an array of another shape.
         """
         n, m = sum(self.reads.values()), sum(self.writes.values())
+        x = x.detach().cpu() if hasattr(x, "detach") else x  # a tensor
         single = np.ndim(x) == 1
         rows = checked_rows([x] if single else x, n, f"{self.name}: x")
         if self._prediction is None:
@@ -235,8 +237,8 @@ def from_torch(
     for one in modules:
         if not isinstance(one, torch.nn.Module):
             raise InputError(
-                f"from_torch: {one!r} is no torch.nn.Module; put a function into the forward method of a module, or "
-                f"give the graph a plain function of CasADi columns"
+                f"from_torch: {type(one).__name__} is no torch.nn.Module; give the module itself, put a function into "
+                f"the forward method of one, or give the graph a plain function of CasADi columns"
             )
     name = type(modules[0]).__name__ if name is None else str(name)
     place = f"from_torch({name})"
@@ -244,16 +246,44 @@ def from_torch(
     own = _checked_deviations(deviations, outputs, place)
     from symgraph.learned.torch_modules.exporting import lowered_module
 
-    members = []
+    members: list[tuple[ca.Function, tuple[Parameter, ...]]] = []
+    found = outputs
     with Progress(f"exporting {name}") as bar:
         for i, one in enumerate(modules):
             label = name if len(modules) == 1 else f"{name}[{i}]"
             bar.wait(f"exporting {label}")
             lowered = lowered_module(one, inputs.shapes, label)
-            matched(outputs, lowered.shapes, place)
-            source = Source(label, one, lowered)
-            members.append((lowered.function, tuple(LiveWeight(source, weight) for weight in lowered.weights)))
-    return TorchModel(name, inputs, outputs, own, members)
+            labels = matched(outputs, lowered.shapes, lowered.names, place)
+            if members and labels != found:
+                raise InputError(
+                    f"{place}: members return their outputs in different orders; make them return the same"
+                )
+            found = labels
+            source = Source(label, one, lowered, inputs.shapes)
+            weights = tuple(LiveWeight(source, weight, leads=not k) for k, weight in enumerate(lowered.weights))
+            members.append((lowered.function, weights))
+    model = TorchModel(name, inputs, found, own, members)
+    _check_signs(model, found, own, place)
+    return model
+
+
+def _check_signs(model: TorchModel, writes: Tensors, deviations: Mapping[str, str], place: str) -> None:
+    """Look at predicted deviations at random inputs: networks often return the logarithm of a variance."""
+    rng = np.random.default_rng(0)
+    for function, parameters in model._members if deviations else ():
+        for _ in range(SIGNS):
+            inputs = [rng.normal(size=function.size_in(i)) for i in range(function.n_in() - len(parameters))]
+            made = function.call([*map(ca.DM, inputs), *(ca.DM(p.value) for p in parameters)])
+            column = np.concatenate([np.array(made[i]).ravel() for i, labels in enumerate(writes.labels) if labels])
+            edges = np.cumsum([0, *writes.sizes.values()])
+            parts = dict(zip(writes.sizes, np.split(column, edges[1:-1]), strict=True))
+            for label, other in deviations.items():
+                if (parts[other] < 0).any():
+                    raise InputError(
+                        f"{place}: {other!r}, which is to hold the deviations of {label!r}, is "
+                        f"{parts[other].min():.3g} at random inputs; of the logarithm of a variance return "
+                        f"exp(0.5 · it), which is a deviation"
+                    )
 
 
 def _checked_deviations(given: Any, writes: Tensors, place: str) -> dict[str, str]:

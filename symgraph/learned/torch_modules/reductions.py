@@ -10,12 +10,14 @@ import casadi as ca
 import numpy as np
 import torch
 
-from symgraph.learned.torch_modules.scalars import logaddexp, where
+from symgraph.learned.torch_modules.scalars import logaddexp, root, where
 from symgraph.learned.torch_modules.symbols import Shape, Symbol, Unavailable, indices
 
 A = torch.ops.aten
 
 Dims = int | Sequence[int] | None
+
+LEAST = -1e30  # less than any score
 
 
 def reduced(x: Symbol, dims: Dims, keep: bool, form: Callable[[ca.MX], ca.MX]) -> Symbol:
@@ -85,12 +87,6 @@ def repeated(row: ca.MX, matrix: ca.MX) -> ca.MX:
     return ca.repmat(row, matrix.shape[0], 1)
 
 
-def root(squares: ca.MX) -> ca.MX:
-    """Return the square root, whose slope at 0 counts as 0."""
-    positive = squares > 0
-    return where(positive, ca.sqrt(ca.if_else(positive, squares, 1)))
-
-
 def norm(matrix: ca.MX, order: float) -> ca.MX:
     """Return the norms of the columns."""
     if order == 2:
@@ -102,6 +98,8 @@ def norm(matrix: ca.MX, order: float) -> ca.MX:
         return (largest if order > 0 else smallest)(sizes)
     if order == 0:
         return total(ca.ne(matrix, 0))
+    if order < 0:
+        return total(sizes**order) ** (1 / order)
     positive = sizes > 0
     powers = total(where(positive, ca.if_else(positive, sizes, 1) ** order))
     return where(powers > 0, ca.if_else(powers > 0, powers, 1) ** (1 / order))
@@ -117,6 +115,15 @@ def softmax(matrix: ca.MX) -> ca.MX:
     """eˣ / Σ eˣ over each column."""
     powers, _ = exponentials(matrix)
     return powers / repeated(total(powers), matrix)
+
+
+def softmax_where(seen: ca.MX, matrix: ca.MX) -> ca.MX:
+    """Return the softmax over what is seen of each column, and 0 elsewhere."""
+    above = largest(ca.if_else(seen, matrix, LEAST))
+    # What is not seen may be far above: its exponential must not be infinite even where it does not count.
+    powers = where(seen, ca.exp(ca.if_else(seen, matrix - repeated(above, matrix), 0)))
+    sums = total(powers)
+    return powers / repeated(ca.if_else(sums > 0, sums, 1), matrix)
 
 
 def log_softmax(matrix: ca.MX) -> ca.MX:

@@ -20,6 +20,18 @@ def where(condition: ca.MX, x: ca.MX) -> ca.MX:
     return ca.MX.binary(ca.OP_IF_ELSE_ZERO, condition, x)
 
 
+def root(squares: ca.MX) -> ca.MX:
+    """Return the square root, whose slope at 0 counts as 0."""
+    positive = squares > 0
+    return where(positive, ca.sqrt(ca.if_else(positive, squares, 1)))
+
+
+def angle(y: ca.MX, x: ca.MX) -> ca.MX:
+    """Return atan2(y, x), whose slopes at 0, 0 count as 0."""
+    somewhere = ca.logic_or(ca.ne(x, 0), ca.ne(y, 0))
+    return where(somewhere, ca.atan2(y, ca.if_else(somewhere, x, 1)))
+
+
 LARGEST_EXPONENT = 80.0  # exp() of more overflows in single precision, and 1 / exp(80) is nothing beside 1
 
 
@@ -125,8 +137,9 @@ def rounded(x: ca.MX) -> Any:
 
 
 def remainder(x: ca.MX, y: Any) -> Any:
-    """x less the multiple of y below it."""
-    return x - y * ca.floor(x / y)
+    """What is left of x beyond a multiple of y, with the sign of y."""
+    rest = ca.fmod(x, y)
+    return rest + where(ca.logic_and(ca.ne(rest, 0), ca.ne(rest < 0, ca.MX(y) < 0)), y)
 
 
 def logaddexp(x: ca.MX, y: ca.MX) -> ca.MX:
@@ -227,8 +240,8 @@ ELEMENTWISE: dict[Any, Callable[..., Any]] = {
     A.minimum.default: ca.fmin,
     A.fmax.default: ca.fmax,
     A.fmin.default: ca.fmin,
-    A.atan2.default: ca.atan2,
-    A.hypot.default: lambda x, y: ca.sqrt(x * x + y * y),
+    A.atan2.default: angle,
+    A.hypot.default: lambda x, y: root(x * x + y * y),
     A.copysign.Tensor: ca.copysign,
     A.fmod.Tensor: ca.fmod,
     A.fmod.Scalar: ca.fmod,

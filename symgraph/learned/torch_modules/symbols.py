@@ -17,6 +17,8 @@ Call = Callable[..., Any]  # an operator and its arguments → what it makes
 
 A = torch.ops.aten
 
+UNITS = 256  # unit vectors that a linear operator is applied to at once
+
 # Operators that move, repeat or drop numbers, or fill up with zeros.
 MOVES = {
     A.view.default,
@@ -115,11 +117,13 @@ class Symbol:
             index does, a tensor (r, c) is the matrix (c, r): its transpose, without a number being moved.
         shape: of the tensor.
         fixed: whether it follows from weights alone.
+        boolean: whether its numbers are 0 and 1, and stand for false and true.
     """
 
     column: ca.MX
     shape: Shape
     fixed: bool = False
+    boolean: bool = False
 
     @property
     def size(self) -> int:
@@ -161,10 +165,19 @@ def indices(shape: Shape) -> npt.NDArray[np.int64]:
     return np.arange(math.prod(shape)).reshape(shape)
 
 
-def constant(value: Any, shape: Shape | None = None) -> Symbol:
+def constant(value: Any) -> Symbol:
     """Return a tensor of numbers."""
-    numbers = np.asarray(value.detach() if isinstance(value, torch.Tensor) else value, dtype=float)
-    return Symbol(ca.MX(ca.DM(numbers.ravel())), numbers.shape if shape is None else shape, fixed=True)
+    tensor = torch.as_tensor(value).detach()
+    numbers = ca.DM(tensor.to(torch.float64).flatten().numpy())
+    return Symbol(ca.MX(numbers), tuple(tensor.shape), fixed=True, boolean=tensor.dtype == torch.bool)
+
+
+def is_boolean(value: Any) -> bool:
+    """Whether a tensor, of any kind, holds booleans."""
+    if isinstance(value, Symbol):
+        return value.boolean
+    tensor = getattr(value, "value", value)  # of one that follows from weights
+    return isinstance(tensor, torch.Tensor) and tensor.dtype == torch.bool
 
 
 def gather(sources: Sequence[Symbol], where: npt.NDArray[np.int64]) -> Symbol:
@@ -209,31 +222,24 @@ def linear(operator: Callable[..., Any], args: Any, kwargs: dict[str, Any]) -> S
     mapped(lambda value: sources.append(value) if isinstance(value, Symbol) else None, (args, kwargs))
     total = sum(source.size for source in sources)
 
-    def result(unit: int) -> torch.Tensor:
-        left = iter(np.cumsum([0, *(source.size for source in sources)]).tolist())
+    def result(units: torch.Tensor) -> torch.Tensor:
+        """Return what the operator makes of one column of all numbers."""
+        left = iter(torch.split(units, [source.size for source in sources]))
 
         def part(value: Any) -> Any:
-            if not isinstance(value, Symbol):
-                return value
-            numbers, begin = torch.zeros(value.size, dtype=torch.float64), next(left)
-            if begin <= unit < begin + value.size:
-                numbers[unit - begin] = 1.0
-            return numbers.reshape(value.shape)
+            return next(left).reshape(value.shape) if isinstance(value, Symbol) else value
 
         return operator(*mapped(part, args), **mapped(part, kwargs))  # type: ignore[no-any-return]  # an aten operator
 
-    rows: list[int] = []
-    columns: list[int] = []
-    numbers: list[float] = []
-    for unit in range(total):
-        made = result(unit)
-        flat = made.flatten().numpy()
-        (places,) = np.nonzero(flat)
-        rows += places.tolist()
-        columns += [unit] * len(places)
-        numbers += flat[places].tolist()
-    shape = tuple(made.shape)
-    matrix = ca.DM.triplet(rows, columns, ca.DM(numbers), math.prod(shape), total)
+    shape = tuple(result(torch.zeros(total, dtype=torch.float64)).shape)
+    blocks = []
+    for begin in range(0, total, UNITS):
+        units = torch.zeros(min(UNITS, total - begin), total, dtype=torch.float64)
+        units[:, begin:].fill_diagonal_(1.0)
+        blocks.append(torch.func.vmap(result)(units).flatten(1).to_sparse())
+    columns, rows = torch.cat(blocks).coalesce().indices().numpy()
+    numbers = torch.cat(blocks).coalesce().values().numpy()
+    matrix = ca.DM.triplet(rows.tolist(), columns.tolist(), ca.DM(numbers), math.prod(shape), total)
     column = ca.mtimes(ca.MX(matrix), ca.vertcat(*[source.column for source in sources]))
     return Symbol(ca.densify(column), shape, all(source.fixed for source in sources))
 

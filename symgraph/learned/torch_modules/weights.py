@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from symgraph.learned.torch_modules.tape import Tape
 
 
+AGAIN = "call from_torch again"
+
+
 class Source:
     """A module, and what is computed from its weights.
 
@@ -26,13 +29,39 @@ class Source:
         name: for messages.
         module: the user's.
         lowered: what was made of it.
+        shapes: of its inputs.
     """
 
-    def __init__(self, name: str, module: torch.nn.Module, lowered: Lowered) -> None:
+    def __init__(self, name: str, module: torch.nn.Module, lowered: Lowered, shapes: Sequence[tuple[int, ...]]) -> None:
         self.name = name
         self._module = module
+        self._lowered = lowered
+        self._shapes = shapes
+        self._settings = self._settings_now()
         self._tape: Tape = lowered.tape
         self._kept = {kept: self._state(kept).clone() for kept in lowered.kept}
+
+    def check(self) -> None:
+        """Compare the module with its expression in numbers, if its layers or settings are others than they were.
+
+        Raises:
+            InputError: it computes something else.
+        """
+        settings = self._settings_now()
+        if settings is not None and settings != self._settings:
+            from symgraph.learned.torch_modules.exporting import agrees
+
+            if not agrees(self._lowered, self._module, self._shapes, self.name):
+                raise InputError(
+                    f"{self.name}: the module's layers, settings or tensors that are no buffers have changed, and it "
+                    f"computes something else than when it was exported; {AGAIN}"
+                )
+            self._settings = settings
+
+    def _settings_now(self) -> str | None:
+        from symgraph.learned.torch_modules.description import settings_of  # brings torch
+
+        return settings_of(self._module)
 
     def states(self, names: Sequence[str]) -> dict[str, torch.Tensor]:
         """Return parameters and buffers of this moment as they are.
@@ -44,7 +73,7 @@ class Source:
             if not _same(value, self._state(name)):
                 raise InputError(
                     f"{self.name}: the buffer {name!r} was a constant when the module was exported, and has changed; "
-                    f"call from_torch again"
+                    f"{AGAIN}"
                 )
         return {name: self._state(name) for name in names}
 
@@ -63,6 +92,8 @@ class Source:
                 f"{self.name}: the module has no {name!r} any more, which it had when it was exported; call "
                 f"from_torch again"
             ) from None
+        if tensor is None:
+            raise InputError(f"{self.name}: {name!r} is None, and was a tensor when the module was exported; {AGAIN}")
         return tensor.detach()  # type: ignore[no-any-return]  # parameters and buffers are tensors
 
 
@@ -72,10 +103,12 @@ class LiveWeight(Parameter):
     Args:
         source: where it is read.
         weight: what to read.
+        leads: whether it checks the module for all of its weights.
     """
 
-    def __init__(self, source: Source, weight: Weight) -> None:
+    def __init__(self, source: Source, weight: Weight, leads: bool = False) -> None:
         self._source = source
+        self._leads = leads
         self._weight = weight
         states = source.states(weight.sources)
         super().__init__(self._computed(states), f"{source.name}.{' + '.join(weight.sources)}")
@@ -84,6 +117,8 @@ class LiveWeight(Parameter):
     @property
     def value(self) -> Array:
         """The numbers, in the shape of the symbol; train the module to change them."""
+        if self._leads:
+            self._source.check()
         states = self._source.states(self._weight.sources)
         # Numbers are compared: there are ways to change a tensor that its version does not tell.
         if not all(_same(state, self._seen[name]) for name, state in states.items()):
@@ -98,11 +133,11 @@ class LiveWeight(Parameter):
     def _computed(self, states: Mapping[str, torch.Tensor]) -> Array:
         rows, columns = self._weight.shape
         numbers = self._source.read(self._weight.step, states)
-        if numbers.numel() != rows * columns:
+        if numbers.numel() != rows * columns or (numbers.ndim and numbers.shape[-1] != rows):
             names = " + ".join(self._weight.sources)
             raise InputError(
-                f"{self._source.name}: the weights {names!r} have {numbers.numel()} elements, and had {rows * columns} "
-                f"when the module was exported; call from_torch again"
+                f"{self._source.name}: the weights {names!r} make a tensor of shape {tuple(numbers.shape)}, and were "
+                f"{columns} × {rows} when the module was exported; {AGAIN}"
             )
         return np.array(numbers.contiguous().numpy().reshape(columns, rows)).T  # a copy: training goes on in place
 
@@ -111,4 +146,6 @@ class LiveWeight(Parameter):
 
 
 def _same(one: torch.Tensor, other: torch.Tensor) -> bool:
-    return one.dtype == other.dtype and one.device == other.device and one.shape == other.shape and one.equal(other)
+    if one.dtype != other.dtype or one.device != other.device or one.shape != other.shape:
+        return False
+    return one.equal(other) or bool(((one == other) | ((one != one) & (other != other))).all())
