@@ -436,6 +436,19 @@ def test_deviations_that_do_not_fit(deviations, words):
     refuses(lambda: from_torch(TwoHeads(), {"a": 2}, writes, deviations=deviations), sg.InputError, words)
 
 
+def test_all_edges_call_the_same_function():
+    """So that a chain of ten steps compiles no longer than one of two."""
+    model = from_torch(mlp(), {"a": 1, "b": 1}, {"y": 1})
+    slots = {"y": sg.State()} | {f"u{k}": sg.Action(low=-1.0, high=1.0) for k in range(3)}
+    graph = sg.Graph(slots, start="n0")
+    for k in range(3):
+        graph.edge(f"n{k}", f"n{k + 1}", sg.Model(model, rename={"a": "y", "b": f"u{k}"}))
+    graph.reward("n3", lambda y: y)
+    function = objective_of(graph).situation({"y": sg.Gaussian(0.1, sd=0.1)}).build.expectation.value_function()
+    inner = [f for f in function.find_functions() if f.name() == "moments"]
+    assert len({hash(f) for f in inner}) == len(inner) == 1
+
+
 # Ensembles
 
 

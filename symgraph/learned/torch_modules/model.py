@@ -75,6 +75,7 @@ class TorchModel:
         """
         view = copy.copy(self)
         view.propagation = checked_option(rule, RULES, f"{self.name}: propagation")
+        view._built = self._built  # one function for all edges becomes one piece of machine code
         return view
 
     def propagate(self, inputs: Mapping[str, Gaussian]) -> dict[str, Gaussian]:
