@@ -330,7 +330,7 @@ def test_casts_to_half_precision_are_passed_over():
 
 
 class Named(nn.Module):
-    def forward(me, x):  # noqa: N805
+    def forward(me, x):
         if x.sum() > 0:
             return x
         return -x

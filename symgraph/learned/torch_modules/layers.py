@@ -209,8 +209,10 @@ def _repeated_heads(call: Call, x: Any, times: int) -> Any:
 def _masked_softmax(call: Call, scores: Any, mask: Any) -> Any:
     if mask is None:
         return call(A._softmax.default, scores, -1, False)
-    if not isinstance(mask, torch.Tensor):
+    if isinstance(mask, Symbol):
         return _softmax_where_seen(call, scores, mask)
+    if not isinstance(mask, torch.Tensor):  # numbers that follow from weights, which are finite
+        return call(A._softmax.default, call(A.add.Tensor, scores, mask), -1, False)
     seen = mask if mask.dtype == torch.bool else mask > -math.inf
     if mask.dtype != torch.bool:
         scores = call(A.add.Tensor, scores, torch.where(seen, mask, 0.0))

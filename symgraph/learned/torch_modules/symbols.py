@@ -104,7 +104,6 @@ LINEAR = {
     A.col2im.default,
     A.scatter_add.default,
     A.index_add.default,
-    A.trace.default,
 }
 
 
@@ -236,7 +235,11 @@ def linear(operator: Callable[..., Any], args: Any, kwargs: dict[str, Any]) -> S
     for begin in range(0, total, UNITS):
         units = torch.zeros(min(UNITS, total - begin), total, dtype=torch.float64)
         units[:, begin:].fill_diagonal_(1.0)
-        blocks.append(torch.func.vmap(result)(units).flatten(1).to_sparse())
+        try:
+            made = torch.func.vmap(result)(units)
+        except (RuntimeError, IndexError):  # of an operator that has no form for many
+            made = torch.stack([result(unit) for unit in units])
+        blocks.append(made.flatten(1).to_sparse())
     columns, rows = torch.cat(blocks).coalesce().indices().numpy()
     numbers = torch.cat(blocks).coalesce().values().numpy()
     matrix = ca.DM.triplet(rows.tolist(), columns.tolist(), ca.DM(numbers), math.prod(shape), total)
