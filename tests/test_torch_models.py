@@ -370,6 +370,16 @@ def test_quadrature_counts_uncertain_directions_only():
     refuses(lambda: objective.value(state, {}), sg.GraphError, "'quadrature' over 4 uncertain directions")
 
 
+def test_hessians_that_would_take_minutes_are_refused():
+    graph = sg.Graph({"x": sg.State(300)}, start="s")
+    graph.reward("s", from_torch(mlp(300), {"x": 300}, {"r": 1}, name="worth"))
+    state = {"x": sg.Gaussian(np.zeros(300), sd=0.1)}
+    objective = objective_of(graph)
+    assert np.isfinite(objective.value({"x": np.zeros(300)}, {}))
+    words = "worth: propagation 'second-order' over 300 uncertain directions ('x')", "'linear'"
+    refuses(lambda: objective.value(state, {}), sg.GraphError, *words)
+
+
 def test_noise_is_added():
     model = sg.Model(from_torch(mlp(), {"a": 1, "b": 1}, {"y": 1}), noise={"y": 0.04})
     assert outcome(task(model), {}, {"a": 0.0, "b": 0.0}).sd == pytest.approx(0.2)

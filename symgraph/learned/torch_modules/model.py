@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     Modules = torch.nn.Module | Sequence[torch.nn.Module]
 
+MOST_CURVED = 200  # directions of a Hessian, whose expression takes seconds to build
 SIGNS = 5  # random inputs at which deviations must not be negative
 OVER_POINTS = ("unscented", "quadrature")  # rules that evaluate a module many times
 
@@ -135,6 +136,13 @@ class TorchModel:
         first = next(i for i, (other, _) in enumerate(self._members) if other is function)
         key = first, rule, uncertain
         if key not in self._built:
+            directions = sum(self.reads[label] for label in uncertain)
+            if rule == "second-order" and directions > MOST_CURVED:
+                raise GraphError(
+                    f"{self.name}: propagation 'second-order' over {directions} uncertain directions "
+                    f"({names(uncertain)}) takes a Hessian of that size; ask for 'linear' or 'mean', or make fewer of "
+                    f"them uncertain"
+                )
             x = {label: ca.MX.sym(f"x{i}", size) for i, (label, size) in enumerate(self.reads.items())}
             sigma = {
                 label: ca.MX.sym(f"s{i}", self.reads[label], self.reads[label]) for i, label in enumerate(uncertain)
