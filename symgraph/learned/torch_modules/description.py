@@ -8,6 +8,7 @@ import hashlib
 import sys
 import sysconfig
 import types
+import weakref
 from collections.abc import Iterator
 from typing import Any
 
@@ -120,6 +121,8 @@ class Description:
             yield from self.of((value.fget, value.fset))
         elif isinstance(value, functools.partial):
             yield from self.of((value.func, value.args, value.keywords))
+        elif isinstance(value, weakref.ref):
+            yield from self.of(value())
         elif isinstance(value, enum.Enum):
             yield repr(value)
         elif isinstance(value, (types.BuiltinFunctionType, types.GetSetDescriptorType, types.MemberDescriptorType)):

@@ -259,16 +259,18 @@ class Lowering:
         if target in COMPOSED:
             first, *others = args
             first = first if first is None else self.lift(first)
-            # A mask that follows from weights may change; what else does is left to the tape as far as that goes.
-            others = [self.lift(a) if isinstance(a, Derived) and is_boolean(a) else a for a in others]
-            settings = {k: self.lift(a) if isinstance(a, Derived) and is_boolean(a) else a for k, a in settings.items()}
+            # Weights go on as they are, so that the tape takes what it can; but for masks, which layers look at.
+            others, settings = (
+                mapped(lambda a: self.lift(a) if isinstance(a, Derived) and is_boolean(a) else a, part)
+                for part in (others, settings)
+            )
             return COMPOSED[target](self.call, first, *others, **settings)
         if target in FILLED:
             return FILLED[target](*args, **settings)
         raise self._refusal(f"calls {target}", advice_on(target))
 
     def _lifted(self, args: Any) -> Any:
-        """Return arguments with all tensors as expressions."""
+        """Return arguments, or named ones, with all tensors as expressions."""
         return mapped(lambda a: self.lift(a) if isinstance(a, (torch.Tensor, Derived)) else a, args)
 
     def _placed(self, target: Any, args: Sequence[Any]) -> list[Any]:
@@ -290,8 +292,7 @@ class Lowering:
         condition = args[0]
         if target is A.where.self and isinstance(condition, torch.Tensor):
             return self._chosen(condition, *map(self.lift, args[1:]))
-        given = [self.lift(a) if isinstance(a, (torch.Tensor, Derived)) else a for a in args]
-        settings = {key: self.lift(a) if isinstance(a, (torch.Tensor, Derived)) else a for key, a in settings.items()}
+        given, settings = self._lifted(args), self._lifted(settings)
         tensors = [a for a in (*given, *settings.values()) if isinstance(a, Symbol)]
         shape = np.broadcast_shapes(*(tensor.shape for tensor in tensors))
         size, fixed = math.prod(shape), all(tensor.fixed for tensor in tensors)
