@@ -20,7 +20,7 @@ import torch
 
 from symgraph.compile.toolchain import private_folder
 from symgraph.learned.torch_modules.description import Description, Unknown
-from symgraph.learned.torch_modules.lowering import Lowered, Weight
+from symgraph.learned.torch_modules.lowered import Lowered, Weight
 from symgraph.learned.torch_modules.tape import Tape
 
 _known: dict[str, Lowered] = {}

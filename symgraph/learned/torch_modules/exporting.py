@@ -19,7 +19,8 @@ from torch.nn.modules import transformer
 
 from symgraph.errors import InputError, SymgraphError
 from symgraph.learned.torch_modules import cache
-from symgraph.learned.torch_modules.lowering import KNOWN, Lowered, Lowering
+from symgraph.learned.torch_modules.lowered import Lowered
+from symgraph.learned.torch_modules.lowering import KNOWN, Lowering
 from symgraph.learned.torch_modules.refusals import described, refused_export
 from symgraph.learned.torch_modules.symbols import leaves
 from symgraph.learned.torch_modules.weights import LiveWeight, Source
@@ -176,7 +177,7 @@ def _difference(
     """Return by how much a function differs from the module at random inputs of given sizes, where outputs are large
     relative to them; infinite if one of them is no number where the other one is.
     """
-    source = Source(name, twin, lowered, shapes)
+    source = Source(name, twin, lowered)
     weights = [ca.DM(LiveWeight(source, weight).value) for weight in lowered.weights]
     worst = [0.0]
     with double_by_default(), torch.no_grad():

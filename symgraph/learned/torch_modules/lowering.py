@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -15,6 +15,7 @@ from torch.export.graph_signature import InputKind, OutputKind
 
 from symgraph.errors import InputError, SymgraphError
 from symgraph.learned.torch_modules.layers import COMPOSED, PLAIN
+from symgraph.learned.torch_modules.lowered import Lowered, Weight
 from symgraph.learned.torch_modules.reductions import REDUCTIONS
 from symgraph.learned.torch_modules.refusals import (
     COMPLEX,
@@ -45,44 +46,6 @@ A = torch.ops.aten
 
 # Named arguments that say how torch keeps numbers, not what they are.
 STORAGE = {"dtype", "layout", "device", "pin_memory", "memory_format", "requires_grad"}
-
-
-@dataclass(frozen=True)
-class Weight:
-    """An input of the lowered function: what to read it from, and its shape in CasADi.
-
-    Attributes:
-        sources: names of the parameters and buffers that it follows from.
-        step: of the tape.
-        shape: (rows, columns).
-    """
-
-    sources: tuple[str, ...]
-    step: int
-    shape: tuple[int, int]
-
-
-@dataclass(frozen=True)
-class Lowered:
-    """A module as a function.
-
-    Attributes:
-        function: inputs, each (n, 1), then weights → outputs, each (m, 1); in torch's order.
-        shapes: of the outputs.
-        tape: what torch computes from weights.
-        weights: the function's inputs after those of the module.
-        kept: names of buffers that became constants.
-        names: of the outputs, where the module returns a dict of tensors.
-        coarsest: the rounding of the coarsest precision that the module asks for inside; 0 for double throughout.
-    """
-
-    function: ca.Function
-    shapes: tuple[tuple[int, ...], ...]
-    tape: Tape
-    weights: tuple[Weight, ...]
-    kept: tuple[str, ...]
-    names: tuple[str, ...]
-    coarsest: float
 
 
 class Lowering:

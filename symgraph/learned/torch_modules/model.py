@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import itertools
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
 import casadi as ca
@@ -253,7 +254,7 @@ def from_torch(
     place = f"from_torch({name})"
     inputs, outputs = tensors_of(reads, f"{place}: reads", READS), tensors_of(writes, f"{place}: writes", WRITES)
     own = _checked_deviations(deviations, outputs, place)
-    from symgraph.learned.torch_modules.exporting import lowered_module
+    from symgraph.learned.torch_modules.exporting import agrees, lowered_module
 
     members: list[tuple[ca.Function, tuple[Parameter, ...]]] = []
     found = outputs
@@ -268,7 +269,7 @@ def from_torch(
                     f"{place}: members return their outputs in different orders; make them return the same"
                 )
             found = labels
-            source = Source(label, one, lowered, inputs.shapes)
+            source = Source(label, one, lowered, partial(agrees, lowered, one, inputs.shapes, label))
             weights = tuple(LiveWeight(source, weight, leads=not k) for k, weight in enumerate(lowered.weights))
             members.append((lowered.function, weights))
     model = TorchModel(name, inputs, found, own, members)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ from symgraph.slots import Array
 if TYPE_CHECKING:
     import torch
 
-    from symgraph.learned.torch_modules.lowering import Lowered, Weight
+    from symgraph.learned.torch_modules.lowered import Lowered, Weight
     from symgraph.learned.torch_modules.tape import Tape
 
 
@@ -29,14 +29,15 @@ class Source:
         name: for messages.
         module: the user's.
         lowered: what was made of it.
-        shapes: of its inputs.
+        agrees: whether that still computes what the module does.
     """
 
-    def __init__(self, name: str, module: torch.nn.Module, lowered: Lowered, shapes: Sequence[tuple[int, ...]]) -> None:
+    def __init__(
+        self, name: str, module: torch.nn.Module, lowered: Lowered, agrees: Callable[[], bool] = lambda: True
+    ) -> None:
         self.name = name
         self._module = module
-        self._lowered = lowered
-        self._shapes = shapes
+        self._agrees = agrees
         self._settings = self._settings_now()
         self._tape: Tape = lowered.tape
         self._kept = {kept: self._state(kept).clone() for kept in lowered.kept}
@@ -49,9 +50,7 @@ class Source:
         """
         settings = self._settings_now()
         if settings is not None and settings != self._settings:
-            from symgraph.learned.torch_modules.exporting import agrees
-
-            if not agrees(self._lowered, self._module, self._shapes, self.name):
+            if not self._agrees():
                 raise InputError(
                     f"{self.name}: the module's layers, settings or tensors that are no buffers have changed, and it "
                     f"computes something else than when it was exported; {AGAIN}"
