@@ -223,11 +223,12 @@ def _belongs(objective: Objective, options: Options) -> dict[str, Any]:
         "J": build.function.serialize(),
         "margins": build.expectation.margins_function().serialize(),
         "sides": [(one.side, one.way) for one in build.expectation.constraints],
-        "parameters": [parameter.value for parameter in build.expectation.inputs.parameters],
     }
+    weights = [parameter.value for parameter in build.expectation.inputs.parameters]
     planned = [{**one.actions, **one.selections} if isinstance(one, (Plan, PlanRow)) else one for one in guesses]
     return {
         "objective": hashlib.sha256(_text(content).encode()).hexdigest(),
+        "set of weights": hashlib.sha256(_text(weights).encode()).hexdigest(),
         "risk": objective.risk,
         "optimizer": repr(Lbfgs() if options["optimizer"] is None else options["optimizer"]),
         "guess": _text(planned),

@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import casadi as ca
 import distributed
 import joblib
 import matplotlib.pyplot as plt
@@ -157,6 +158,24 @@ def test_a_file_of_another_objective_or_other_options_is_refused(objective, tmp_
     wider = throw()
     wider.graph.slots["u"] = sg.Action(2, low=-2, high=2)  # the expression is the same
     refused_file(wider, file, sg.InputError, "begun with another objective;")
+
+
+def test_a_file_that_was_begun_with_other_weights(tmp_path):
+    weight = sg.Parameter(0.3, "w")
+
+    class Shift:
+        reads, writes, parameters = ("u",), ("reward",), (weight,)
+
+        def propagate(self, inputs):
+            return {"reward": sg.Gaussian(-((inputs["u"].mean - weight.symbol) ** 2), ca.MX(1, 1))}
+
+    graph = sg.Graph({"u": sg.Action(low=0.0, high=1.0)}, "a")
+    graph.reward("a", Shift())
+    objective, file = sg.Objective(sg.unroll(graph), compiled=False), tmp_path / "plans.jsonl"
+    sg.solve_many(objective, [{}], QUICK, file=file, processes=1)
+    weight.value = 0.4
+    words = str(file), "begun with another set of weights;"
+    refuses(lambda: sg.solve_many(objective, [{}], QUICK, file=file, processes=1), sg.InputError, *words)
 
 
 def test_a_file_of_something_else_is_refused(objective, tmp_path):
