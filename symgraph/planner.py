@@ -12,7 +12,7 @@ import numpy as np
 
 from symgraph.binding import BoundModel
 from symgraph.compile.crew import cores
-from symgraph.compile.kernel import Stop
+from symgraph.compile.kernel import BoundKernel, Stop
 from symgraph.constraints import counting
 from symgraph.errors import InputError, SolveError, did_you_mean, names
 from symgraph.exploration import Decisions, explore, lacking_models, met
@@ -233,21 +233,31 @@ def _problem(
         cut=lambda choices: objective.chosen(_names(objective, choices)).situation(situation.given),
         guesses=tuple(_guess(objective, one, allowed) for one in _listed(guess)),
         progress=progress,
-        constrained=_constrained(objective, situation, low, high, stop),
+        constrained=_constrained(objective, situation, low, high, stop, progress),
         stop=stop,
     )
 
 
-def _constrained(objective: Objective, situation: Situation, low: Array, high: Array, stop: Stop) -> Constrained | None:
+def _constrained(
+    objective: Objective, situation: Situation, low: Array, high: Array, stop: Stop, progress: Progress
+) -> Constrained | None:
     constraints = situation.build.expectation.constraints
     if not constraints:
         return None
+
+    def merit(multipliers: Array, weights: Array) -> BoundKernel:
+        if not situation.build.has_merit_kernel:
+            progress.wait("compiling")
+            situation.build.merit_kernel.compile_for_one()
+            progress.begin("planning")
+        return situation.bind_merit(low, high, multipliers, weights, stop)
+
     return Constrained(
         constraints,
         *objective.bounds,
         lambda choices: counting(constraints, _names(objective, choices)),
         lambda actions, hot: situation.build.margins([actions, hot, *situation.shared])[0],
-        lambda multipliers, weights: situation.bind_merit(low, high, multipliers, weights, stop),
+        merit,
     )
 
 

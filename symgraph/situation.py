@@ -79,6 +79,10 @@ class Build:
     def has_kernel(self) -> bool:
         return "kernel" in self.__dict__
 
+    @property
+    def has_merit_kernel(self) -> bool:
+        return "merit_kernel" in self.__dict__
+
 
 @dataclass(frozen=True)
 class Situation:
