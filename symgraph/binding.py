@@ -24,6 +24,8 @@ REQUIREMENT = "requirement"  # likewise
 SINGLE = {REWARD: "a reward returns one scalar", REQUIREMENT: "a requirement returns a scalar or a column"}
 
 SCALAR_LIMIT = 50_000  # instructions up to which a model is written out scalar by scalar
+FEW_SCALARS = 5_000  # up to which nothing else is worth a thought
+MATRIX_GAIN = 20  # between them: what products of matrices must save, since compilers take long over scalars
 
 # The rule of a plain function that does not name one.
 DEFAULT_PROPAGATION = {"edge": "linear", "probability": "linear", "reward": "second-order", "requirement": "linear"}
@@ -124,11 +126,17 @@ class BoundModel:
             traced = self._trace(ca.SX)
         except Exception:
             return self._moments_in(ca.MX, *self._trace(ca.MX), uncertain)
-        x, y = traced
         directions = sum(self._sizes[label] for label in uncertain)
-        if ca.Function("y", list(x.values()), list(y.values())).n_instructions() * (1 + directions) <= SCALAR_LIMIT:
-            return self._moments_in(ca.SX, x, y, uncertain)
-        return self._moments_in(ca.MX, *self._trace(ca.MX), uncertain)
+        scalars = _instructions(*traced) * (1 + directions)
+        if scalars <= FEW_SCALARS:
+            return self._moments_in(ca.SX, *traced, uncertain)
+        try:
+            matrices = self._trace(ca.MX)
+        except Exception:  # it computes with what SX alone has
+            return self._moments_in(ca.SX, *traced, uncertain)
+        if scalars <= SCALAR_LIMIT and MATRIX_GAIN * _instructions(*matrices) * (1 + directions) > scalars:
+            return self._moments_in(ca.SX, *traced, uncertain)
+        return self._moments_in(ca.MX, *matrices, uncertain)
 
     def _moments_in(
         self, kind: Any, x: Mapping[str, Any], y: Mapping[str, Any], uncertain: tuple[str, ...]
@@ -357,6 +365,11 @@ def _writes(
             raise GraphError(f"{place} writes {label!r} twice; change rename")
         writes[name] = (label, size)
     return writes
+
+
+def _instructions(x: Mapping[str, Any], y: Mapping[str, Any]) -> int:
+    """Return the number of steps from symbols to expressions."""
+    return int(ca.Function("y", list(x.values()), list(y.values())).n_instructions())
 
 
 def _holds_nan(returned: Any) -> bool:

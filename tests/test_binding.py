@@ -484,3 +484,20 @@ def test_what_cannot_be_fitted_or_does_not_propagate_is_no_learner():
     with_fit.fit = lambda x, y: None
     for model in (lambda speed: {"hit": speed}, with_fit, Own(lambda inputs: {"hit": inputs["speed"]})):
         assert bound(model).learner is None
+
+
+def test_products_of_large_matrices_are_not_written_out():
+    """A network of two layers in CasADi: thousands of scalars, a dozen operations on matrices."""
+    w, v = ca.DM.ones(60, 3) / 7, ca.DM.ones(60, 60) / 60
+    wide, narrow = (lambda x: {"y": ca.sum1(ca.mtimes(v, ca.tanh(ca.mtimes(w, x))))}), (lambda x: {"y": ca.sumsqr(x)})
+    for model in (wide, narrow):
+        graph = sg.Graph({"x": sg.Action(3, low=-1, high=1), "y": sg.State()}, start="a")
+        graph.edge("a", "b", model)
+        graph.reward("b", lambda y: y)
+        objective = objective_of(graph)
+        task = objective.situation({}).build.expectation.value_function()
+        kinds = {f.class_name() for f in task.find_functions() if f.name() == "f_lambda"}
+        assert ("MXFunction" in kinds) == (model is wide)
+        x = ca.MX.sym("x", 3)
+        expected = ca.Function("f", [x], [model(x)["y"]])([0.1, 0.2, -0.4])
+        assert objective.value({}, {"x": [0.1, 0.2, -0.4]}) == pytest.approx(float(expected), rel=1e-13)

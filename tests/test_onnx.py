@@ -50,7 +50,7 @@ def test_a_plain_function_of_an_imported_network(file, compiled):
     net = ca.GraphBuilder(file).create("net", {"symbolic": True})
 
     def push(force, mass):
-        return {"moved": ca.vec(net(ca.MX(ca.vertcat(force, mass))))}
+        return {"moved": ca.vec(net(ca.vertcat(force, mass)))}
 
     graph = sg.Graph({"force": sg.Action(low=-1, high=1), "mass": sg.State(), "moved": sg.State()}, start="before")
     graph.edge("before", "after", push)
