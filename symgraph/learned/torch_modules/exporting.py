@@ -81,7 +81,7 @@ def exported(twin: torch.nn.Module, shapes: Sequence[tuple[int, ...]], name: str
             program = torch.export.export(twin, inputs, strict=False)
             table = torch.export.default_decompositions()
             for known in KNOWN:
-                table.pop(known, None)  # type: ignore[no-untyped-call]
+                table.pop(known, None)  # type: ignore[no-untyped-call]  # torch gives it no types
             program = program.run_decompositions(table)
         except Exception as error:
             raise refused_export(name, twin, error, shapes) from None
